@@ -48,7 +48,7 @@ from PIL import Image
 from foldgauss import video
 from foldgauss.cli.fitting import demo
 from foldgauss.cli.viewing import view as viewing
-from foldgauss.io import Sound, datasets, export, save_video_model, write_frames, write_video
+from foldgauss.io import Sound, datasets, save_video_model, write_frames, write_vegas_ply, write_video
 from foldgauss.video import FitConfig, VideoModel, fit
 
 ROOT = Path(__file__).parents[1]
@@ -324,7 +324,7 @@ def _holidays(folder: Path) -> None:
 def _ply(folder: Path) -> None:
     """A video as the published code writes it."""
     model = fit(_clip(), FitConfig(num_gaussians=100, steps=5, follow_camera=False), fps=24.0).model
-    export(model, "ply", folder / "point_cloud.ply")
+    write_vegas_ply(folder / "point_cloud.ply", model)
 
 
 #: By name as pages write it.

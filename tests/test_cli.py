@@ -19,7 +19,7 @@ from foldgauss.cli.fitting import demo as demonstration
 from foldgauss.cli.fitting import fit as fitting
 from foldgauss.cli.viewing import info as drawing
 from foldgauss.io import load_video_model, read_video, save_video_model, write_video
-from foldgauss.io.models.video_model import CLIP_NOTES, read_metadata
+from foldgauss.io.models.video_model import read_metadata
 from foldgauss.jobs import runner
 from foldgauss.video import interpolate_frames
 
@@ -166,50 +166,6 @@ def test_a_variable_frame_rate_is_kept(tmp_path):
         assert np.abs(read["half"].frames[shown].astype(int) - fitted[frame]).mean() < 2
         assert np.abs(read["back"].frames[31 - min(shown, 31)].astype(int) - fitted[frame]).mean() < 2
     assert np.abs(read["held"].frames.astype(int) - fitted[3]).mean() < 2
-
-
-def test_how_a_clip_was_read_is_kept(tmp_path):
-    """Images with the values of 12 bits are dark; with their level of white, every command reads them so."""
-    clip, model = tmp_path / "clips" / "clip", tmp_path / "m.safetensors"
-    few = ("--gaussians", 400, "--steps", 5)
-    clip.mkdir(parents=True)
-    for k, frame in enumerate(blobs()):
-        cv2.imwrite(str(clip / f"{k}.png"), frame[..., ::-1].astype(np.uint16) * 16)
-    call(
-        "fit",
-        clip,
-        "--out",
-        model,
-        *few,
-        err="the largest value is 4,080 of 65,535, as in data of 12 bits, which look dark",
-    )
-    call("evaluate", model, clip, err="the largest value is 4,080")
-    write_video(tmp_path / "8.mp4", blobs(), 10.0)
-    for options in ((), ("--segment-seconds", 0.1)):
-        assert run("fit", clip, "--out", model, "--overwrite", "--levels", 4080, *options, *few) == 0
-        assert read_metadata(model)["reading"] == {"levels": 4080}
-        assert load_video_model(model).render(0.5).max() > 0.8
-        assert "warning" not in call("evaluate", model, clip).err
-        call(
-            "evaluate",
-            model,
-            tmp_path / "8.mp4",
-            code=2,
-            err="VIDEO: expected the clip that the model was fitted to, clip read with levels=4080, got",
-        )
-        call(
-            "view",
-            model,
-            "--out",
-            tmp_path / "p.html",
-            "--original",
-            tmp_path / "8.mp4",
-            code=2,
-            err="--original: expected the clip that the model was fitted to, clip read with",
-        )
-    assert {"reading"} <= set(CLIP_NOTES)  # which edit and compress keep
-    assert run("fit-many", tmp_path / "clips", "--out", tmp_path / "models", "--levels", 4080, *few) == 0
-    assert read_metadata(tmp_path / "models" / "clip.fgz")["reading"] == {"levels": 4080}
 
 
 def test_sound_of_a_range_begins_with_it(tmp_path):

@@ -90,10 +90,6 @@ ODD = [
     {"frame_seconds": 5},
     {"frame_seconds": True},
     {"first_second": -1},
-    {"reading": {"levels": 0}},
-    {"reading": {"deinterlace": ["fields"]}},
-    {"reading": {"size": [2, 2]}},
-    {"reading": "levels"},
 ]
 
 

@@ -15,7 +15,7 @@ from soft_models import soft_model
 
 from foldgauss.cli.app.application import app, load_commands
 from foldgauss.cli.app.registry import COMMANDS, EXAMPLES
-from foldgauss.io import export, save_video_model, write_video
+from foldgauss.io import save_video_model, write_pseudomesh, write_vegas_ply, write_video
 
 #: Of a terminal; Typer's help and ours go by it.
 WIDTHS = (80, 160)
@@ -33,11 +33,11 @@ NAMES = sorted(commands())
 @pytest.mark.parametrize("name", NAMES)
 def test_every_command_has_examples_that_parse(name):
     assert EXAMPLES.get(name), f"foldgauss {name} --help shows no example"
-    for example in EXAMPLES[name]:
-        words = shlex.split(example.line.partition(" > ")[0])
+    for line in EXAMPLES[name].values():
+        words = shlex.split(line.partition(" > ")[0])
         assert words[0] == "foldgauss"
         assert " ".join(words[1:]).startswith(name)
-        assert len(example.line) < 90, "longer than most terminals are wide"
+        assert len(line) < 90, "longer than most terminals are wide"
         command, rest = commands()[""], words[1:]
         if not rest[0].startswith("-"):
             command, rest = command.commands[rest[0]], rest[1:]
@@ -50,8 +50,8 @@ def test_every_command_has_examples_that_parse(name):
 def test_help_shows_options_defaults_and_examples(name, width, monkeypatch):
     monkeypatch.setenv("COLUMNS", str(width))
     told = call(*name.split(), "--help").out
-    for example in EXAMPLES[name]:
-        assert f"     {example.line}\n" in told  # whole, to be copied
+    for line in EXAMPLES[name].values():
+        assert f"     {line}\n" in told  # whole, to be copied
     panels = told.partition(" Examples\n")[0]
     assert all(len(line) <= width for line in panels.splitlines())
     text = " ".join(re.sub("[│╭╮╰╯─]", " ", panels).split())
@@ -127,8 +127,8 @@ def work(tmp_path_factory):
     write_video(folder / "holiday.mp4", model.frames(), 12.0)
     save_video_model(folder / "holiday.safetensors", model, metadata={"clip": "holiday.mp4"})
     save_video_model(folder / "beach.safetensors", model, metadata={"clip": "holiday.mp4"})
-    export(model, "ply", folder / "video.ply")
-    export(model, "obj", folder / "mesh")
+    write_vegas_ply(folder / "video.ply", model)
+    write_pseudomesh(folder / "mesh", model)
     (folder / "night.toml").write_text('[[edits]]\ndo = "recolor"\ngain = 0.5\n')
     return folder
 

@@ -123,7 +123,7 @@ def test_begun_anew_and_left_alone(long_clip, whole, tmp_path):
 
 
 def test_that_nobody_listens_any_more_costs_no_fit(long_clip, whole, tmp_path, monkeypatch):
-    monkeypatch.setattr(_jobs_view, "print_json", Mock(side_effect=BrokenPipeError))
+    monkeypatch.setattr("builtins.print", Mock(side_effect=BrokenPipeError))
     assert run("fit", long_clip, "--out", tmp_path / "m.safetensors", *SEGMENTS, "--log-json") == 0
     assert (tmp_path / "m.safetensors").read_bytes() == whole.read_bytes()
 

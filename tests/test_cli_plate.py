@@ -8,7 +8,7 @@ from commands import call, run, seconds_heard, write_tone
 from soft_models import soft_model
 
 from foldgauss.cli.viewing import render as plate
-from foldgauss.io import load_video_model, read_masks, read_video, save_video_model, write_frames, write_image
+from foldgauss.io import load_video_model, read_masks, read_video, save_video_model, write_frames
 from foldgauss.io.edit_script import EditScriptError, parse_edit_script
 from foldgauss.video import NothingMoves, by_mask, edit
 from foldgauss.video.motion.moving_object import nothing_moves
@@ -52,34 +52,11 @@ def test_scripts_select_what_moves(model, tmp_path):
     assert load_video_model(tmp_path / "gone.safetensors").num_gaussians == wanted.num_gaussians
 
 
-@pytest.mark.parametrize("command", ["edit", "plate"])
-def test_masks_as_stored_are_those_of_the_stretched_clip(command, tmp_path):
-    """Of a clip with pixels twice as wide as high; a model file names both sizes."""
-    height, width = MODEL.size
-    about = {"stretched": ((height, width // 2), MODEL.size)}
-    save_video_model(tmp_path / "m.safetensors", MODEL, metadata=about)
-    mask = np.repeat(np.uint8(255 * MASKS[0])[..., None], 3, -1)
-    write_image(tmp_path / "shown.png", mask)
-    write_image(tmp_path / "stored.png", np.ascontiguousarray(mask[:, ::2]))
-    made = []
-    for name in ("shown", "stored"):
-        script, target = tmp_path / f"{name}.toml", tmp_path / f"{name}-{command}"
-        words = (
-            [script, "--out", target] if command == "edit" else ["--masks", tmp_path / f"{name}.png", "--out", target]
-        )
-        script.write_text(f'[selections.it]\nmask = "{name}.png"\nframe = 2\n[[edits]]\nselect = "it"\ndo = "vanish"\n')
-        command_line = ["edit"] if command == "edit" else ["render", "--plate"]
-        assert run(*command_line, tmp_path / "m.safetensors", *words) == 0
-        made.append(read_video(target).frames)
-    assert (made[0] != np.stack(list(MODEL.frames()))).any()
-    np.testing.assert_array_equal(*made)
-
-
 def test_scripts_say_where_nothing_moves(model, tmp_path, monkeypatch):
     search = Mock(side_effect=nothing_moves("an object that moves against the background", "none"))
     monkeypatch.setattr(selectors, "find_moving_object", search)
     monkeypatch.setattr(plate, "find_moving_object", search)
-    with pytest.raises(EditScriptError, match=r"line 2, \[selections.it\]: moving: expected an object that moves"):
+    with pytest.raises(EditScriptError, match=r"\[selections.it\]: moving: expected an object that moves"):
         parse_edit_script(SCRIPT).apply(MODEL)
     with pytest.raises(EditScriptError, match="moving: expected true, got False"):
         parse_edit_script(SCRIPT.replace("true", "false"))
@@ -96,7 +73,7 @@ def test_an_object_without_gaussians_is_told(monkeypatch):
     few[2, 0, :3] = True
     monkeypatch.setattr(selectors, "find_moving_object", lambda frames: few)
     told = (
-        r"line 2, \[selections.it\]: moving: expected an object that has Gaussians of its own, got one that covers up "
+        r"script, \[selections.it\]: moving: expected an object that has Gaussians of its own, got one that covers up "
     )
     told += "to 3 of 2,560 pixels of a frame, but to which no Gaussian belongs. Lower the threshold"
     with pytest.raises(EditScriptError, match=told):

@@ -170,7 +170,7 @@ def test_edit_acts_on_all_segments(here, tmp_path):
         here,
         "still.toml",
         code=1,
-        err="still.toml, line 4, [[edits]] number 1: at: expected times of the segment that shows",
+        err="still.toml, [[edits]] number 1: at: expected times of the segment that shows",
     )
     assert sorted(tmp_path.iterdir()) == before
 

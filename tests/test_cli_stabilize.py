@@ -3,12 +3,10 @@
 import numpy as np
 import pytest
 from commands import call, run
-from soft_models import soft_model
 from tiny_clips import NUM_FRAMES, model_of_12
 
-from foldgauss.cli.shared import arguments
 from foldgauss.io import load_video_model, read_video, save_video_model
-from foldgauss.video import FitConfig, fit, interpolate_frames, interpolated_times, stabilize, times_at
+from foldgauss.video import FitConfig, fit, interpolate_frames, interpolated_times, stabilize
 
 STABLE = ("--stabilize", "smooth")
 
@@ -61,28 +59,4 @@ def test_shots_are_named(tmp_path):
             "shots, each on its own; they begin at frames 0, ",
             "The motion of the camera was not found before frames",
         ],
-    )
-
-
-@pytest.mark.parametrize("stabilized", [False, True])
-def test_repeated_frames_take_less_time(tmp_path, monkeypatch, stabilized):
-    model, images = soft_model(), tmp_path / "images"
-    monkeypatch.setattr(arguments, "even_durations", lambda video: np.array([1, 1, 0.25, 1, 1, 1]))
-    save_video_model(tmp_path / "m.safetensors", model)
-    options = [*STABLE, "--border", "keep"] if stabilized else []
-    how = ["--skip-repeats", "--speed", "0.5", "--no-flow", "--out", images, *options]
-    call("render", tmp_path / "m.safetensors", *how, out="Frames that repeat the one before: 3.")
-    shown = np.interp(np.arange(13) / 2, [0, 1, 2, 2.25, 3.25, 4.25, 5.25], np.arange(7))
-    video = stabilize(model, border="keep") if stabilized else model
-    wanted = list(video.frames(times_at(np.asarray(model.frame_times.times()), shown)))
-    np.testing.assert_allclose(read_video(images).frames, wanted, atol=1)
-    call(
-        "render",
-        tmp_path / "m.safetensors",
-        *how,
-        "--overwrite",
-        "--sound",
-        tmp_path / "m.safetensors",
-        code=2,
-        err="--skip-repeats: expected no --sound",
     )

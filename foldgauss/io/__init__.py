@@ -1,14 +1,13 @@
 """Reading and writing files; every output appears whole or not at all.
 
 Clips, images and masks (`read_video`, `write_video`, `index_video`, `read_masks`), models (`save_video_model`,
-`load_video_model`, `save_compact`), formats of other programs (`export`, `read_vegas_ply`, `read_pseudomesh`), the
-HTML player (`write_html`), scripts of edits (`read_edit_script`), and the history of a fit. Sample clips:
-`foldgauss.io.datasets`.
+`load_video_model`, `save_compact`), formats of other programs (`write_vegas_ply`, `write_3dgs_frames`,
+`write_pseudomesh`), the HTML player (`write_html`), scripts of edits (`read_edit_script`), and the history of a fit.
+Sample clips: `foldgauss.io.datasets`.
 """
 
 from foldgauss.io._atomic import OutputError
 from foldgauss.io.edit_script import EditScript, EditScriptError, read_edit_script
-from foldgauss.io.exchange.export import export
 from foldgauss.io.exchange.gaussians_ply import (
     frame_gaussians,
     read_3dgs_ply,
@@ -18,7 +17,7 @@ from foldgauss.io.exchange.gaussians_ply import (
 )
 from foldgauss.io.exchange.ply_file import FormatError
 from foldgauss.io.exchange.pseudomesh import Pseudomesh, read_pseudomesh, write_pseudomesh
-from foldgauss.io.exchange.vegas_ply import read_vegas_ply, write_vegas_ply
+from foldgauss.io.exchange.vegas_ply import read_vegas_ply, write_vegas_ply, write_vegas_segments
 from foldgauss.io.history import HistoryFile, read_history, write_curves
 from foldgauss.io.media.clip import Clip, VideoError
 from foldgauss.io.media.indexing import FrameIndex, LazyFrames, index_video, read_indexed
@@ -45,7 +44,6 @@ __all__ = [
     "Pseudomesh",
     "Sound",
     "VideoError",
-    "export",
     "format_indices",
     "frame_gaussians",
     "html_page",
@@ -73,5 +71,6 @@ __all__ = [
     "write_image",
     "write_pseudomesh",
     "write_vegas_ply",
+    "write_vegas_segments",
     "write_video",
 ]

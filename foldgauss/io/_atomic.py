@@ -72,9 +72,14 @@ def check_input(path: Path, expected: str, kind: type[ParameterError] = Paramete
     """Raise MissingInput for an input that is missing, `kind` for a pipe or a device: opening may not end."""
     if not os.path.exists(path):
         raise missing_error(path, expected)
-    if not (os.path.isfile(path) or os.path.isdir(path)):
-        got = f"{str(path)!r}, a pipe or a device"
-        raise invalid("path", expected=expected, got=got, cure="Save its output to a file.", kind=kind)
+    require(
+        os.path.isfile(path) or os.path.isdir(path),
+        "path",
+        expected=expected,
+        got=f"{str(path)!r}, a pipe or a device",
+        cure="Save its output to a file.",
+        kind=kind,
+    )
 
 
 def resolve(path: PathLike) -> Path:

@@ -11,7 +11,7 @@ import numpy as np
 from foldgauss._numerics.random_streams import Stream, make_generator
 from foldgauss._runtime.checks import check_one_of, check_within, invalid, is_integer, require
 from foldgauss.io._atomic import MissingInput, PathLike
-from foldgauss.io.media.clip import Clip, Levels, Range, Size, format_size
+from foldgauss.io.media.clip import Clip, Range, Size, format_size
 from foldgauss.io.media.images import image_paths, read_image
 from foldgauss.io.media.masks import read_labels
 from foldgauss.io.media.reading import center_window, read_video
@@ -172,7 +172,7 @@ def davis(
     found = [path for path in paths if path.is_file()]
     if len(found) < len(paths):
         return MaskedClip(clip, None, f"{len(found)} of {len(paths)} frames have a mask in {str(place)!r}")
-    masks, whole = read_labels(paths), read_image(shown[0], Levels()).shape[:2]
+    masks, whole = read_labels(paths), read_image(shown[0]).shape[:2]
     require(
         masks.shape[1:] == whole,
         "root",
@@ -188,11 +188,14 @@ def davis(
 def _davis_folder(root: Path, sequence: str, resolution: str) -> Path:
     """The folder with the frames of a sequence; errors list the available ones."""
     images = root / "JPEGImages"
-    if not images.is_dir():
-        cure = "Give the folder DAVIS that the archive of the data set unpacks to (https://davischallenge.org)."
-        raise invalid(
-            "root", expected="a folder with JPEGImages in it", got=repr(str(root)), cure=cure, kind=MissingInput
-        )
+    require(
+        images.is_dir(),
+        "root",
+        expected="a folder with JPEGImages in it",
+        got=repr(str(root)),
+        cure="Give the folder DAVIS that the archive of the data set unpacks to (https://davischallenge.org).",
+        kind=MissingInput,
+    )
     check_one_of("resolution", resolution, _folders(images))
     sequences = _folders(images / resolution)
     if sequence not in sequences:

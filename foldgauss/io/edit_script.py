@@ -1,4 +1,4 @@
-"""Edit scripts: TOML files that select and change objects of a video, with the line of every error.
+"""Edit scripts: TOML files that select and change objects of a video. Errors name the table and the key.
 
 The schema, in which every table is optional; paths are relative to the script, angles are in degrees, and all other
 values are in the units of `Edit`:
@@ -26,7 +26,7 @@ import operator
 import os
 import re
 import tomllib
-from collections import Counter, deque
+from collections import deque
 from collections.abc import Callable, Collection, Mapping
 from pathlib import Path
 from types import MappingProxyType
@@ -34,7 +34,7 @@ from typing import Any
 
 import numpy as np
 
-from foldgauss._runtime.checks import ParameterError, invalid, require
+from foldgauss._runtime.checks import ParameterError, invalid, require, short_repr
 from foldgauss.io._atomic import MissingInput, PathLike, describe_missing, resolve
 from foldgauss.io.media.masks import read_masks
 from foldgauss.io.models.selections import parse_indices, parse_ranges
@@ -57,15 +57,12 @@ MAX_BYTES = 32_000_000
 #: Largest number of parts of a dotted key; the parser makes a table for each.
 MAX_PARTS = 16
 _DEEP_KEY = re.compile(rf"(?<![\w\"'-])(?:[\w\"'-]+[ \t]*\.[ \t]*){{{MAX_PARTS}}}")
-#: The header of a table, and a key, at the beginning of a line.
-_HEADER = re.compile(r"\s*(\[{1,2})\s*([A-Za-z\"'][^\[\]=,]*)\]{1,2}\s*(?:#.*)?$")
-_KEY = re.compile(r"\s*([\"']?)([\w-]+)\1\s*[.=]")
 #: Largest absolute value of a number; no position, time or angle is larger, and squares could overflow.
 LARGEST = 1e9
 
 
 class EditScriptError(ValueError):
-    """An invalid script; the message is one line with file, line, table, key, expected and got."""
+    """An invalid script; the message is one line with file, table, key, expected and got."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -121,12 +118,13 @@ _KINDS = {
     "layers": _Kind("tables, each begun by [[layers]]", lambda value: isinstance(value, list) and _are_tables(value)),
     "camera": _Kind("a table begun by [camera]", lambda value: isinstance(value, dict)),
     "moving": _Kind("true", lambda value: value is True),
+    "where": _Kind("'front' or 'behind'", lambda value: value in ("front", "behind")),
     "frames": _FRAMES,
     **dict.fromkeys(("any", "all", "without"), _NAMES),
     **dict.fromkeys(("mask", "model", "script"), _PATH),
     **dict.fromkeys(("frame", "label", "num_gaussians", "segment"), _WHOLE),
     **dict.fromkeys(("alive", "follow", "originals"), _BOOL),
-    **dict.fromkeys(("do", "select", "curve", "where", "indices"), _TEXT),
+    **dict.fromkeys(("do", "select", "curve", "indices"), _TEXT),
 }
 _COMBINATION = ("any", "all", "without")
 _MASK_FILE = ("label", "level")
@@ -168,7 +166,6 @@ class EditScript:
 
     tables: dict[str, Any]
     source: str  # the script's name in errors
-    text: str
     folder: Path  # paths are relative to it
     _includes: tuple[Path, ...] = ()  # the path of this script and of those that include it
 
@@ -182,9 +179,9 @@ class EditScript:
         """The edited video: a plain `VideoModel` if all edits could be baked; segmented if `video` is.
 
         `origin`: the metadata of its file, as `read_metadata` returns them: `frames`, the range of its clip that the
-        video shows, to which masks of the whole clip are cut, and `stretched`, as of `read_masks`.
+        video shows, to which masks of the whole clip are cut.
 
-        **Raises:** `EditScriptError`, with the line, for values that the edits refuse and files that cannot be read.
+        **Raises:** `EditScriptError` for values that the edits refuse and files that cannot be read.
         """
         edits, named = edit(video), {}
         for name, table in self.tables.get("selections", {}).items():
@@ -213,8 +210,7 @@ class EditScript:
         criteria = _convert_frames(table)
         if "mask" in criteria:
             options = {key: criteria.pop(key) for key in criteria.keys() & set(_MASK_FILE)}
-            options |= {"size": video.size, "stretched": origin.get("stretched")}
-            masks, frames = read_masks(self._path(criteria["mask"]), **options), origin.get("frames")
+            masks, frames = read_masks(self._path(criteria["mask"]), size=video.size, **options), origin.get("frames")
             if masks.ndim == 3 and frames is not None and len(masks) != video.num_frames:
                 shown = masks[slice(*frames)]  # of masks of the whole clip
                 masks = shown if len(shown) == video.num_frames else masks
@@ -265,13 +261,13 @@ class EditScript:
         return self.folder / os.path.expanduser(given)
 
     def _context(self, *table: str | int, **named: str) -> "_TableContext":
-        return _TableContext(self.source, self.text, table, named)
+        return _TableContext(self.source, table, named)
 
 
 def read_edit_script(path: PathLike) -> EditScript:
     """Read a script and check tables, keys, names and types of values. `EditScript.apply` checks the values.
 
-    **Raises:** `FileNotFoundError`; `EditScriptError` with line and key for all other errors.
+    **Raises:** `FileNotFoundError`; `EditScriptError` with table and key for all other errors.
 
     **Example:** `read_edit_script("edits.toml").apply(load_video_model("clip.safetensors"))`.
     """
@@ -306,48 +302,37 @@ def parse_edit_script(text: str, *, source: str = "script", folder: PathLike = "
     try:
         tables = tomllib.loads(text)
     except (ValueError, RecursionError) as error:
-        raise _toml_error(source, text, error) from error
-    script = EditScript(tables, source, text, Path(folder))
-    _check_keys(script._context(), tables, ("selections", "edits", "layers", "camera"))
-    selections: dict[str, dict] = tables.get("selections", {})
+        message = " ".join(str(error).split()) or "endless nesting"
+        raise EditScriptError(f"{source}: expected TOML, got: {message}.") from error
+    script = EditScript(tables, source, Path(folder))
+    with script._context():
+        _check_keys(tables, ("selections", "edits", "layers", "camera"))
     known: dict[str, None] = {}
-    for name, table in selections.items():
-        _check_selection(script._context("selections", name), table, known)
+    for name, table in tables.get("selections", {}).items():
+        with script._context("selections", name):
+            _check_selection(table, known)
         known[name] = None
     for number, table in enumerate(tables.get("edits", ())):
-        _check_edit(script._context("edits", number), table, known)
+        with script._context("edits", number):
+            _check_edit(table, known)
     for number, table in enumerate(tables.get("layers", ())):
-        _check_layer(script._context("layers", number), table)
-    _check_keys(script._context("camera"), tables.get("camera", {}), ("azimuth", "elevation"))
+        with script._context("layers", number):
+            _check_keys(table, ("model", "where", "freeze", "script"), ("model",))
+    with script._context("camera"):
+        _check_keys(tables.get("camera", {}), ("azimuth", "elevation"))
     return script
-
-
-def _toml_error(source: str, text: str, error: Exception) -> EditScriptError:
-    """An error with the message of `tomllib`, whose line number is put where other errors have it."""
-    message = " ".join(str(error).split()) or "endless nesting"
-    place = re.search(r" \(at (?:line (\d+), (column \d+)|end of document)\)$", message)
-    if place is None:
-        return EditScriptError(f"{source}: expected TOML, got: {message}.")
-    line, where = place[1] or text.count("\n") + 1, place[2] or "the text's end"
-    return EditScriptError(f"{source}, line {line}: expected TOML, got: {message[: place.start()]}, {where}.")
 
 
 @dataclasses.dataclass(frozen=True)
 class _TableContext:
-    """A table of the script; as a context manager it adds file, line, table and key to errors raised inside.
+    """A table of the script; as a context manager it adds file, table and key to errors raised inside.
 
     `named`: the script's keys by the parameter names that errors mention.
     """
 
     source: str
-    text: str
     table: tuple[str | int, ...]
     named: Mapping[str, str] = dataclasses.field(default_factory=dict)
-
-    def require(self, condition: object, key: str | None, expected: str, got: object, cure: str = "") -> None:
-        """Raise the error of `invalid` for a key, or for the table, unless `condition` is true."""
-        if not condition:
-            raise self._locate(key, str(invalid(key or "table", expected=expected, got=got, cure=cure)))
 
     def __enter__(self) -> None:
         return None
@@ -355,16 +340,11 @@ class _TableContext:
     def __exit__(self, kind, error, trace) -> None:
         if isinstance(error, EditScriptError) or not isinstance(error, ValueError | TypeError | OSError):
             return
-        text, known = str(error), None
+        text = str(error)
         if isinstance(error, ParameterError):
             keys = [self.named.get(name, name) for name in error.parameter.split(", ")]
-            text, known = f"{', '.join(keys)}: {error.problem}", next(filter(self._line, keys), None)
-        raise self._locate(known, " ".join(text.split())) from error
-
-    def _locate(self, key: str | None, text: str) -> EditScriptError:
-        line = self._line(key) or self._line(None)
-        where = f"{self.source}, line {line}" if line else self.source
-        return EditScriptError(f"{where}{self._name()}: {text}")
+            text = f"{', '.join(keys)}: {error.problem}"
+        raise EditScriptError(f"{self.source}{self._name()}: {' '.join(text.split())}") from error
 
     def _name(self) -> str:
         match self.table:
@@ -374,96 +354,53 @@ class _TableContext:
                 return ""
         return f", [{'.'.join(map(str, self.table))}]"
 
-    def _line(self, key: str | None) -> int | None:
-        """The line of a key of the table, None if no line begins with it; of the table that of what it stands in."""
-        lines, table = _key_lines(self.text), self.table
-        if key is not None:
-            return lines.get((*table, key))
-        return next((lines[table[:num]] for num in range(len(table), 0, -1) if table[:num] in lines), None)
 
-
-@functools.lru_cache(maxsize=1)
-def _key_lines(text: str) -> Mapping[tuple[str | int, ...], int]:
-    """The line, from 1, of each table and of each key that begins a line; tables of an array count from
-    0. `tomllib` does not report them; a script that is laid out otherwise has lines of what its keys stand in."""
-    lines, table, counts = {}, (), Counter()
-    for number, line in enumerate(text.split("\n"), 1):
-        if header := _HEADER.match(line):
-            table = tuple(part.strip(" \t\"'") for part in header[2].split("."))
-            for num in range(len(table)):
-                lines.setdefault(table[: num + 1], number)
-            if header[1] == "[[":
-                counts[table] += 1
-                table = (*table, counts[table] - 1)
-                lines[table] = number
-        elif key := _KEY.match(line):
-            lines.setdefault((*table, key[2]), number)
-    return lines
-
-
-def _check_keys(
-    context: _TableContext, table: dict[str, Any], known: Collection[str], needed: Collection[str] = ()
-) -> None:
+def _check_keys(table: dict[str, Any], known: Collection[str], needed: Collection[str] = ()) -> None:
     """Raise for unknown keys, missing required keys, and values of a wrong type."""
     for key in table:
-        _check_known(context, key, "one of ", key, sorted(known))
+        _check_known(key, "one of ", key, sorted(known))
     for key in needed:
-        context.require(key in table, None, f"the key {key!r}", ", ".join(sorted(table)) or "an empty table")
+        require(key in table, "table", expected=f"the key {key!r}", got=", ".join(sorted(table)) or "an empty table")
     for key, value in table.items():
         kind = _KINDS.get(key, _NUMBERS)
-        context.require(kind.holds(value), key, kind.expected, _truncated_repr(value))
+        require(kind.holds(value), key, expected=kind.expected, got=short_repr(value))
 
 
-def _check_known(context: _TableContext, key: str, expected: str, word: str, known: Collection[str]) -> None:
+def _check_known(key: str, expected: str, word: str, known: Collection[str]) -> None:
     """Raise unless a word is known; `expected` says what it is one of."""
     near = [] if word in known else difflib.get_close_matches(word, known, 1)
-    context.require(
+    require(
         word in known,
         key,
-        expected + (", ".join(known) or "there is none"),
-        _truncated_repr(word),
-        f"Did you mean {near[0]!r}?" if near else "",
+        expected=expected + (", ".join(known) or "there is none"),
+        got=short_repr(word),
+        cure=f"Did you mean {near[0]!r}?" if near else "",
     )
 
 
-def _truncated_repr(value: Any) -> str:
-    try:
-        text = repr(value)
-    except (ValueError, RecursionError):  # thousands of digits, or deeply nested
-        return "something else"
-    return text if len(text) <= 60 else text[:57] + "..."
-
-
-def _check_selection(context: _TableContext, table: dict[str, Any], known: Collection[str]) -> None:
+def _check_selection(table: dict[str, Any], known: Collection[str]) -> None:
     """Check a selection after those that are `known`."""
-    context.require(table, None, "at least one criterion", "none")
+    require(table, "table", expected="at least one criterion", got="none")
     if table.keys() & set(_COMBINATION):
-        _check_keys(context, table, _COMBINATION)
+        _check_keys(table, _COMBINATION)
         for key, names in table.items():
             for name in names:
-                _check_known(context, key, "a selection from before: ", name, known)
+                _check_known(key, "a selection from before: ", name, known)
     elif "indices" in table:
-        _check_keys(context, table, ("indices", "num_gaussians", "segment"))
-        with context:
-            deque(parse_ranges(table["indices"]), maxlen=0)
+        _check_keys(table, ("indices", "num_gaussians", "segment"))
+        deque(parse_ranges(table["indices"]), maxlen=0)
     else:
-        _check_keys(context, table, _CRITERIA + (_MASK_FILE if "mask" in table else ()))
+        _check_keys(table, _CRITERIA + (_MASK_FILE if "mask" in table else ()))
 
 
-def _check_edit(context: _TableContext, table: dict[str, Any], selections: Collection[str]) -> None:
+def _check_edit(table: dict[str, Any], selections: Collection[str]) -> None:
     do = table.get("do")
-    got = "none" if do is None else _truncated_repr(do)
-    context.require(isinstance(do, str), "do", "one of " + ", ".join(ACTIONS), got)
-    _check_known(context, "do", "one of ", do, ACTIONS)
-    _check_keys(context, table, ("do", "select", *ACTIONS[do].keys), ACTIONS[do].required)
+    got = "none" if do is None else short_repr(do)
+    require(isinstance(do, str), "do", expected="one of " + ", ".join(ACTIONS), got=got)
+    _check_known("do", "one of ", do, ACTIONS)
+    _check_keys(table, ("do", "select", *ACTIONS[do].keys), ACTIONS[do].required)
     if "select" in table:
-        _check_known(context, "select", "the name of a selection: ", table["select"], selections)
-
-
-def _check_layer(context: _TableContext, table: dict[str, Any]) -> None:
-    _check_keys(context, table, ("model", "where", "freeze", "script"), ("model",))
-    where = table.get("where", "behind")
-    context.require(where in ("front", "behind"), "where", "'front' or 'behind'", repr(where))
+        _check_known("select", "the name of a selection: ", table["select"], selections)
 
 
 def _select_indices(

@@ -1,11 +1,10 @@
 """Figures of `foldgauss.analysis.plot` as files."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 from foldgauss._runtime.optional_imports import import_optional
-from foldgauss.analysis.plot import Panel, plot_tradeoff
 from foldgauss.io._atomic import PathLike, atomic_path
 
 DPI = 110
@@ -22,14 +21,3 @@ def write_figure(path: PathLike, draw: Callable[[Any], object], size: tuple[floa
     with atomic_path(path) as temporary:
         figure.savefig(temporary, format="png", dpi=DPI)
     return Path(path)
-
-
-def write_tradeoff(
-    path: PathLike, panels: Sequence[Panel], quality: Sequence[float], names: Sequence[tuple[str, str]]
-) -> Path:
-    """`plot_tradeoff` as a PNG, whole or not at all. Raises ImportError without matplotlib (`foldgauss[plot]`)."""
-
-    def draw(figure: Any) -> None:
-        plot_tradeoff(panels, quality, names, figure.subplots(1, len(panels), sharey=True))
-
-    return write_figure(path, draw, (5.5 * len(panels), 6.5))

@@ -35,9 +35,9 @@ class HistoryFile:
     def __init__(self, path: PathLike, resumed_at: int | None = None, psnr: float | None = None):
         self.path, self._file, self._last, self._append = Path(path), None, 0, False
         if resumed_at is not None and self.path.exists():
-            self._append, kept = True, [line for line in _read_lines(self.path) if line["step"] <= resumed_at]
+            self._append, kept = True, [info_line(one) for one in read_history(self.path) if one.step <= resumed_at]
             self._last = kept[-1]["step"] if kept else 0
-            same = psnr is None or (kept and kept[-1].get("psnr") == _to_json(psnr))
+            same = psnr is None or (kept and kept[-1]["psnr"] == _to_json(psnr))
             require(
                 self._last == resumed_at and same,
                 "history",
@@ -72,9 +72,21 @@ def info_line(info: FitInfo) -> dict[str, Any]:
 
 
 def read_history(path: PathLike) -> list[FitInfo]:
-    """The steps of a history file, which may belong to a running fit. Raises ValueError for another file."""
-    lines = [{name: value for name, value in line.items() if value is not None} for line in _read_lines(Path(path))]
-    return [FitInfo(*(line.get(name, _NULL.get(name)) for name in FitInfo._fields)) for line in lines]
+    """The steps of a history file, which may belong to a running fit: its last line may be incomplete.
+
+    Raises ValueError for another file.
+    """
+    text = Path(path).read_text(encoding="utf-8", errors="replace")
+    found = [_parse_line(line) for line in text.split("\n")[:-1]]
+    if None in found or not _START.startswith(text[: len(_START)]):
+        broken = found.index(None) + 1 if None in found else 1
+        raise invalid(
+            "history",
+            expected="one JSON object with a step per line",
+            got=f"something else in line {broken} of {str(path)!r}",
+            cure="Choose another path, or remove the file.",
+        )
+    return found
 
 
 def write_curves(path: PathLike, history: Iterable[FitInfo]) -> Path:
@@ -92,29 +104,13 @@ def _to_json(value: Any) -> Any:
     return float(f"{value:.{_DIGITS}g}") if math.isfinite(value) else None
 
 
-def _read_lines(path: Path) -> list[dict[str, Any]]:
-    """The complete lines of a history; the last may be incomplete after a killed process."""
-    text = path.read_text(encoding="utf-8", errors="replace")
-    lines = [_parse_line(line) for line in text.split("\n")[:-1]]
-    if None in lines or not _START.startswith(text[: len(_START)]):
-        broken = lines.index(None) + 1 if None in lines else 1
-        raise invalid(
-            "history",
-            expected="one JSON object with a step per line",
-            got=f"something else in line {broken} of {str(path)!r}",
-            cure="Choose another path, or remove the file.",
-        )
-    return lines
-
-
-def _parse_line(text: str) -> dict[str, Any] | None:
-    """One line, or None where it is invalid. Fields may be missing, or added by a later version."""
+def _parse_line(text: str) -> FitInfo | None:
+    """One line, or None where it is invalid."""
     try:
-        line = json.loads(text)
-    except (ValueError, RecursionError):
+        info = FitInfo(**json.loads(text))
+    except (ValueError, TypeError, RecursionError):
         return None
-    if not isinstance(line, dict) or not is_integer(line.get("step"), 0):
-        return None
-    numbers = (line.get(name) for name in FitInfo._fields if name != "stopped_by")
-    valid = all(value is None or (isinstance(value, int | float) and not isinstance(value, bool)) for value in numbers)
-    return line if valid and isinstance(line.get("stopped_by"), str | None) else None
+    info = info._replace(**{name: value for name, value in _NULL.items() if getattr(info, name) is None})
+    *numbers, stopped_by = info
+    valid = is_integer(info.step, 0) and all(isinstance(value, int | float) for value in numbers)
+    return info if valid and isinstance(stopped_by, str | None) else None

@@ -22,12 +22,10 @@ def describe_source(clip: Clip, seed: int) -> dict[str, Any]:
 
 def describe_reading(clip: Clip | FrameIndex) -> dict[str, Any]:
     """The metadata about when frames are shown: `frame_seconds`, with the end, where they are not evenly spaced, and
-    `first_second` and `stretched`, as of `Clip`; and the options other than default by which they were read, `reading`.
+    `first_second`, as of `Clip`.
     """
     about: dict[str, Any] = {} if clip.times is None else {"frame_seconds": [*clip.times.tolist(), clip.duration]}
-    about |= {"first_second": clip.first_second} if clip.first_second else {}
-    about |= {} if clip.stretched is None else {"stretched": clip.stretched}
-    return about | ({"reading": clip.reading.changed} if clip.reading.changed else {})
+    return about | ({"first_second": clip.first_second} if clip.first_second else {})
 
 
 def has_other_frames(about: Mapping[str, Any], clip: Clip) -> bool:

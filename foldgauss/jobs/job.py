@@ -11,7 +11,6 @@ from typing import Any, NamedTuple
 
 from foldgauss._runtime.checks import require
 from foldgauss.io._atomic import MissingInput, describe_missing
-from foldgauss.io.media.clip import AS_STORED, Reading
 from foldgauss.io.media.images import IMAGE_SUFFIXES, image_paths, natural_sort_key
 from foldgauss.io.media.writing import ANIMATION_SUFFIXES
 from foldgauss.io.models.compact import COMPACT_SUFFIX
@@ -53,9 +52,9 @@ class FitJob:
 
     `clip` and `target` are paths that every worker can open; `size` is the (height, width) of the frames, or None;
     `frames` the range (first, stop) of the clip, or None. With `index`, the file of a `FrameIndex`, frames are found by
-    seeking, and counted as `index.span` does. `reading`: options of `read_video`, without an index. `fps` replaces the
-    clip's frame rate. `source` identifies the clip: results of another source are not reused. `metadata` is added to
-    that of the model file. Checkpoint and record are in `folder`, by default beside the model.
+    seeking, and counted from the first one of the index. `fps` replaces the clip's frame rate. `source` identifies the
+    clip: results of another source are not reused. `metadata` is added to that of the model file. Checkpoint and record
+    are in `folder`, by default beside the model.
     """
 
     name: str
@@ -65,7 +64,6 @@ class FitJob:
     size: tuple[int, int] | None = None
     frames: tuple[int | None, int | None] | None = None
     index: str | None = None
-    reading: Reading = AS_STORED
     fps: float | None = None
     checkpoint_seconds: float | None = None
     folder: str | None = None
@@ -76,7 +74,6 @@ class FitJob:
     def request(self) -> dict[str, Any]:
         """What the results depend on, as JSON represents it: results of an equal request are reused."""
         asked = {"config": dataclasses.asdict(self.config), "size": self.size, "frames": self.frames}
-        asked |= {"reading": self.reading.changed}
         return json.loads(json.dumps(asked | {"source": self.source}))
 
     @property
@@ -199,7 +196,6 @@ def make_jobs(
     size: tuple[int, int] | None = None,
     frames: tuple[int | None, int | None] | None = None,
     checkpoint_seconds: float | None = None,
-    reading: Reading = AS_STORED,
 ) -> list[FitJob]:
     """A job for each clip; models go to the folder `out` under the clips' names, such as "one.mp4.fgz".
 
@@ -218,7 +214,6 @@ def make_jobs(
             size,
             frames,
             checkpoint_seconds=checkpoint_seconds,
-            reading=reading,
             folder=str(out / RECORDS),
             source=stamp_clip(clip),
         )

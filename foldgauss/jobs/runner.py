@@ -102,7 +102,7 @@ def run_fit(
         cure="Give a quality, a size or a PSNR.",
     )
     if job.index is None:
-        clip = read_video(job.clip, frames=job.frames, size=job.size, **job.reading._asdict())
+        clip = read_video(job.clip, frames=job.frames, size=job.size)
     else:
         clip = read_indexed(FrameIndex.load(job.index), *job.frames, size=job.size)
         clip = dataclasses.replace(clip, fps=job.fps or clip.fps)

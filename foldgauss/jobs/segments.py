@@ -16,7 +16,6 @@ from foldgauss._runtime.checks import invalid, is_integer, is_within, require
 from foldgauss._runtime.settings import flatten
 from foldgauss.io import FrameIndex, index_video, join_segments, read_indexed
 from foldgauss.io._atomic import OutputError, atomic_path
-from foldgauss.io.media.clip import AS_STORED, Reading
 from foldgauss.io.models.video_model import MODEL_SUFFIX, keep_origin, load_video_model, read_metadata
 from foldgauss.io.provenance import describe_reading
 from foldgauss.jobs.job import FitJob, file_digest, limit_range, stamp_clip
@@ -128,16 +127,13 @@ def plan_long_fit(
     segment_seconds: float = SEGMENT_SECONDS,
     overlap: int = OVERLAP,
     checkpoint_seconds: float | None = None,
-    reading: Reading = AS_STORED,
-    on_frame: Callable[[], None] = lambda: None,
     restart: bool = False,
 ) -> LongFit:
     """Index a clip and plan its segments, or continue the plan that exists, unless `restart`.
 
     Segments end at scene cuts near their length, `segment_seconds`; otherwise they share `overlap` frames with the
-    next. Each segment has the settings `config`, and a part of `size_mb` in proportion to its frames. `clip`,
-    `size`, `frames` and the options of `reading` as in `read_video`. Memory grows with the clip by some tens of bytes
-    per frame only.
+    next. Each segment has the settings `config`, and a part of `size_mb` in proportion to its frames. `clip`, `size`
+    and `frames` as in `read_video`. Memory grows with the clip by some tens of bytes per frame only.
 
     Raises ValueError for settings out of range, for a folder with the plan of other settings or another clip, and with
     `restart` for one with other files; `VideoError`, FileNotFoundError, `OutputError`.
@@ -154,14 +150,14 @@ def plan_long_fit(
     require(is_integer(overlap, 1), "overlap", expected="a whole number of frames >= 1", got=repr(overlap))
     clip, target = Path(clip).absolute(), Path(target).absolute()
     folder = segments_folder(target)
-    request = {"config": dataclasses.asdict(config), "size": size, "frames": frames, "reading": reading.changed}
+    request = {"config": dataclasses.asdict(config), "size": size, "frames": frames}
     request = json.loads(json.dumps(request | {"segment_seconds": float(segment_seconds), "overlap": overlap}))
     if restart:
         _check_folder(folder)
     plan = None if restart else _load_plan(folder, request)
     index = _load_index(folder, plan, clip)
     if index is None:
-        index = index_video(clip, frames=frames, on_frame=on_frame, **reading._asdict())
+        index = index_video(clip, frames=frames)
         require(
             plan is None or plan["digest"] == index.digest,
             "clip",
@@ -190,7 +186,6 @@ def plan_long_fit(
     begin = 0 if frames is None else frames[0] or 0
     jobs = []
     for number, (span, own) in enumerate(zip(spans, configs, strict=True)):
-        low, high = index.span(*span)  # as `read_video` counts, where damaged frames are missing
         job = FitJob(
             name=f"segment {number}",
             clip=str(clip),
@@ -202,7 +197,7 @@ def plan_long_fit(
             fps=index.fps,
             checkpoint_seconds=checkpoint_seconds,
             source={"digest": index.digest},
-            metadata={"clip": clip.name, "frames": [begin + low, begin + high]},
+            metadata={"clip": clip.name, "frames": [begin + span[0], begin + span[1]]},
         )
         jobs.append(job)
     return LongFit(target, folder, index, tuple(spans), tuple(jobs), metadata)

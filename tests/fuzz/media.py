@@ -104,9 +104,6 @@ def _more_images() -> list[bytes]:
 
 
 def _read_picture(path: Path) -> None:
-    if chance(path) % 4 == 1:
-        with contextlib.suppress(VideoError):  # which those of 8 bits raise
-            read_video(path, levels=4095)
     clip = read_video(path.parent if chance(path) % 4 == 0 else path)
     assert (clip.frames.dtype, clip.frames.ndim) == (np.uint8, 4)
 
@@ -182,9 +179,6 @@ def _read_clip(path: Path) -> None:
         with warnings.catch_warnings(action="ignore"):  # about how the clip was read
             assert read_masks(path).dtype == bool
             _refused(path)
-    if number in (1, 2):
-        with contextlib.suppress(VideoError):  # which an interlaced clip raises, or another
-            read_video(path, deinterlace="refuse" if number == 1 else "fields")
     clip = read_video(path, **_WANTED[number])
     assert clip.num_frames >= 1
 

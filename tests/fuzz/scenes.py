@@ -148,9 +148,7 @@ def _line(line: bytes, random: Random) -> bytes:
 
 def _read_mesh(path: Path) -> None:
     read_obj(path)
-    axes = "y-up" if chance(path) % 2 else "y-down"
-    mesh = read_pseudomesh(path.parent, axes=axes)
-    assert mesh.num_frames == 1
+    assert read_pseudomesh(path.parent).num_frames == 1
 
 
 OBJ = Target(

@@ -211,7 +211,8 @@ def test_what_once_did_harm_is_refused(name, data, outcome, tmp_path):
 
 
 def test_a_history_without_psnr_is_another_fits(tmp_path):
-    (tmp_path / "h.jsonl").write_text('{"step": 5}\n')
+    line = '{"step": 5, "progress": 0.5, "loss": 0.1, "psnr": null, "num_gaussians": 9, "num_alive": 9, '
+    (tmp_path / "h.jsonl").write_text(line + '"seconds": 1.0, "seconds_left": 1.0, "stopped_by": null}\n')
     with pytest.raises(ValueError, match="that of the fit which is resumed"):
         HistoryFile(tmp_path / "h.jsonl", resumed_at=5, psnr=20.0)
 

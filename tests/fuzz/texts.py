@@ -11,7 +11,7 @@ import numpy as np
 from PIL import Image
 
 from foldgauss._runtime.checks import ParameterError
-from foldgauss.cli.measuring.tradeoff import Record
+from foldgauss.cli.measuring.tradeoff import open_record
 from foldgauss.io import HistoryFile, read_history, save_video_model
 from foldgauss.io.edit_script import EditScriptError, read_edit_script
 from foldgauss.io.history import info_line
@@ -312,7 +312,7 @@ TRADEOFF = Target(
     "tradeoff",
     ".json",
     lambda: [_record()],
-    lambda path: Record(path, {"a": 1, "b": [1, 2]}, machine={}),
+    lambda path: open_record(path, {"a": 1, "b": [1, 2]}),
     (ParameterError,),
     (json_text_changed,),
     says=("expected", "holds results of other settings"),

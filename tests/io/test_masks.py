@@ -1,23 +1,12 @@
 """Masks of an object from images, folders and videos."""
 
-import json
-from fractions import Fraction
-
-import cv2
 import numpy as np
 import pytest
-from made_clips import encode
 from PIL import Image
 from tiny_clips import MASK_SIZE as SIZE
 from tiny_clips import labels, write_mask
 
-from foldgauss.io import index_video, read_indexed, read_masks, read_video, write_image, write_video
-from foldgauss.io.media.indexing import FrameIndex
-from foldgauss.io.provenance import describe_reading
-
-#: Display matrices of MP4, as it is and turned by 90 degrees clockwise.
-_UPRIGHT = [1 << 16, 0, 0, 0, 1 << 16, 0, 0, 0, 1 << 30]
-_TURNED = [0, 1 << 16, 0, -(1 << 16), 0, 0, SIZE[0] << 16, 0, 1 << 30]
+from foldgauss.io import read_masks, write_image, write_video
 
 
 @pytest.fixture
@@ -82,37 +71,6 @@ def test_cut_as_frames_are(folder):
     whole = read_masks(folder, label=2)
     np.testing.assert_array_equal(read_masks(folder, label=2, size=(40, 40)), whole[:, :, 10:50])
     np.testing.assert_array_equal(read_masks(folder, label=2, size=(10, 30)), whole[:, 10:30])
-
-
-@pytest.mark.parametrize(
-    ("aspect", "turn", "stretched"),
-    [(2, 0, (SIZE, (40, 120))), (Fraction(1, 2), 0, (SIZE, (80, 60))), (2, 90, ((60, 40), (120, 40))), (1, 0, None)],
-)
-def test_masks_as_stored_are_stretched_as_the_clip(tmp_path, aspect, turn, stretched):
-    """A disc of the clip, and its mask at the size of the frames as stored, upright."""
-    y, x = np.mgrid[: SIZE[0], : SIZE[1]]
-    disc = (np.hypot(y - 12, x - 20) < 9)[..., None].repeat(3, -1)
-    context = {"sample_aspect_ratio": Fraction(aspect), "bit_rate": 2_000_000}
-    encode(tmp_path / "clip.mp4", np.uint8(255 * disc)[None], "mpeg4", "yuv420p", given="rgb24", context=context)
-    if turn:
-        data = (tmp_path / "clip.mp4").read_bytes()
-        one, turned = (np.array(rows, ">i4").tobytes() for rows in (_UPRIGHT, _TURNED))
-        (tmp_path / "clip.mp4").write_bytes(data[::-1].replace(one[::-1], turned[::-1], 1)[::-1])  # of the track
-    Image.fromarray(np.uint8(255 * (np.rot90(disc, -1) if turn else disc))).save(tmp_path / "mask.png")
-    clip = read_video(tmp_path / "clip.mp4")
-    assert clip.stretched == stretched
-    index = index_video(tmp_path / "clip.mp4")
-    index.save(tmp_path / "index.npz")
-    for one in (clip, read_indexed(index, 0, 1), FrameIndex.load(tmp_path / "index.npz")):
-        about = json.loads(json.dumps(describe_reading(one)))
-        for size in (None, (30, 30)):
-            shown = read_video(tmp_path / "clip.mp4", size=size).frames[0, ..., 0] > 127
-            mask = read_masks(tmp_path / "mask.png", size=size, stretched=about.get("stretched"))
-            if size is None:
-                assert mask.shape == shown.shape
-            else:
-                mask = cv2.resize(np.uint8(mask), size) > 0
-            assert np.mean(mask != shown) < 0.03
 
 
 #: Below `folder`: a path, options of `read_masks`, and the error.

@@ -2,6 +2,7 @@
 
 import dataclasses
 import re
+import secrets
 from contextlib import contextmanager
 
 import cv2
@@ -24,15 +25,16 @@ from editor_page import (
 )
 from soft_models import NUM, SIZE, soft_model
 
-from foldgauss.cli.viewing.page_server import PageServer, make_token
+from foldgauss.cli.viewing.page_server import PageServer
 from foldgauss.io import (
-    export,
     html_page,
     load_video_model,
     read_vegas_ply,
     read_video,
     save_video_model,
+    write_3dgs_ply,
     write_gaussians_ply,
+    write_vegas_ply,
 )
 from foldgauss.io.edit_script import parse_edit_script, read_edit_script
 from foldgauss.io.page.player_page import SaveTarget
@@ -46,7 +48,7 @@ def test_the_empty_page_opens_any_model(opened, compact, tmp_path):
     assert not bare.page.locator("#transport").is_visible()  # there is nothing to play
     model = soft_model(options=RenderOptions(), seed=3)
     save_video_model(tmp_path / "plain.safetensors", model)
-    export(model, "ply", tmp_path / "vegas.ply")
+    write_vegas_ply(tmp_path / "vegas.ply", model)
     for path in (tmp_path / "plain.safetensors", compact, tmp_path / "vegas.ply"):
         bare.page.evaluate("window.foldgauss.seek = null")
         drop(bare, path)
@@ -61,7 +63,7 @@ def test_the_empty_page_opens_any_model(opened, compact, tmp_path):
 def test_a_vegas_file_without_a_size_is_asked_for_it(opened, tmp_path):
     bare = opened(None, fresh=True)
     model = soft_model(options=RenderOptions())
-    path = export(model, "ply", tmp_path / "theirs.ply")
+    path = write_vegas_ply(tmp_path / "theirs.ply", model)
     path.write_bytes(re.sub(rb"comment foldgauss [^\n]*\n", b"", path.read_bytes()))
     drop(bare, path)
     bare.page.locator("#facts-needed").wait_for()
@@ -76,7 +78,7 @@ def test_a_vegas_file_without_a_size_is_asked_for_it(opened, tmp_path):
 @pytest.mark.parametrize("how", [{}, {"axes": "y-up", "depth_step": 2e-3, "sh_degree": 0}])
 def test_a_3dgs_frame_looks_like_the_frame_it_was_exported_from(opened, tmp_path, how):
     bare, model = opened(None, fresh=True), soft_model(options=RenderOptions(low_pass=0.5))
-    drop(bare, export(model, "ply3dgs", tmp_path / "frame.ply", times=[0.4], **how))
+    drop(bare, write_3dgs_ply(tmp_path / "frame.ply", model, 0.4, **how))
     bare.until("foldgauss.seek")
     wanted = VideoRenderer(model).frame(0.4).astype(float)
     far = np.abs(bare.picture() - wanted)
@@ -159,7 +161,7 @@ def test_files_that_cannot_be_opened_are_told(opened, tmp_path, name, content, m
 def test_damaged_models_are_told(opened, compact, tmp_path):
     bare = opened(None)
     good = save_video_model(tmp_path / "m.safetensors", soft_model()).read_bytes()
-    scene = export(soft_model(), "ply3dgs", tmp_path / "m.ply", times=[0.4]).read_bytes()
+    scene = write_3dgs_ply(tmp_path / "m.ply", soft_model(), 0.4).read_bytes()
     for name, content in (
         ("cut.safetensors", good[:-100]),
         ("nan.safetensors", good[:-8] + np.float32([np.nan, 1]).tobytes()),
@@ -179,7 +181,7 @@ def serving(model, script, token):
 
 
 def test_view_saves_to_disk_and_takes_it_up_again(browser, compact, tmp_path):
-    script, token, page = tmp_path / "holiday.edit.toml", make_token(), Opened(browser)
+    script, token, page = tmp_path / "holiday.edit.toml", secrets.token_urlsafe(32), Opened(browser)
 
     @contextmanager
     def shown():
@@ -210,7 +212,7 @@ def test_view_saves_to_disk_and_takes_it_up_again(browser, compact, tmp_path):
 
 @pytest.mark.slow
 def test_view_keeps_what_others_wrote_to_the_script(browser, compact, tmp_path):
-    script, token = tmp_path / "clip.edit.toml", make_token()
+    script, token = tmp_path / "clip.edit.toml", secrets.token_urlsafe(32)
     with serving(compact, script, token) as server:
         first = Opened(browser, server.url).ready()
         read_script(first, IT + EDITS["move"])

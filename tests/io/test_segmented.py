@@ -14,7 +14,6 @@ from soft_models import NUM, assert_same, soft_model
 from foldgauss.io import (
     ModelFileError,
     OutputError,
-    export,
     html_page,
     join_segments,
     load_video_model,
@@ -22,6 +21,9 @@ from foldgauss.io import (
     read_vegas_ply,
     save_compact,
     save_video_model,
+    write_3dgs_ply,
+    write_pseudomesh,
+    write_vegas_segments,
 )
 from foldgauss.io.models import segmented
 from foldgauss.io.models.compact import MAGIC
@@ -213,7 +215,7 @@ def test_a_source_that_does_not_fit_its_header_is_refused(change, text, work, tm
         ([(0, "a"), (8, "b")], r"^segments\[1\]\.first: expected one that begins at frame 1 to 7"),
         ([(4, "b"), (0, "a")], "begin at frame 0"),
         (["a"], r"^sources\[0\]: expected \(number of its first frame, model file\)"),
-        ([("a", 0)], r"^sources\[0\]: expected the number of its first frame first"),
+        ([("a", 0)], r"^sources\[0\]: expected \(number of its first frame, model file\), got \('a', 0\)"),
         ([(0, 7)], "^path: expected a path"),
     ],
 )
@@ -314,7 +316,7 @@ def test_headers_that_make_no_sense_are_refused(chosen, change, text, work, tmp_
 def test_vegas_files_are_one_for_each_segment(tmp_path):
     parts = [soft_model(seed=k, num_frames=num) for k, num in enumerate(LENGTHS)]
     video = SegmentedVideo.from_models(list(zip(FIRSTS, parts, strict=True)))
-    export(video, "ply", tmp_path / "out")
+    write_vegas_segments(tmp_path / "out", video)
     names = [f"segment-{number:03d}.ply" for number in range(3)]
     assert sorted(path.name for path in (tmp_path / "out").iterdir()) == names
     for name, model in zip(names, parts, strict=True):
@@ -322,24 +324,22 @@ def test_vegas_files_are_one_for_each_segment(tmp_path):
         assert again.num_frames == model.num_frames
         np.testing.assert_allclose(again.render(0.4), model.render(0.4), atol=1e-3)
     with pytest.raises(OutputError, match="3 segments"):
-        export(video, "ply", tmp_path / "out")
-    export(video, "ply", tmp_path / "out", overwrite=True)
+        write_vegas_segments(tmp_path / "out", video)
+    write_vegas_segments(tmp_path / "out", video, overwrite=True)
     (tmp_path / "out" / "notes.txt").touch()
     with pytest.raises(OutputError, match=r"notes\.txt"):
-        export(video, "ply", tmp_path / "out", overwrite=True)
-    with pytest.raises(ValueError, match="out: expected a folder"):
-        export(video, "ply", tmp_path / "one.ply")
+        write_vegas_segments(tmp_path / "out", video, overwrite=True)
 
 
 def test_frames_go_out_as_they_are_played(tmp_path):
     parts = [soft_model(seed=k, num_frames=num) for k, num in enumerate(LENGTHS)]
     video = SegmentedVideo.from_models(list(zip(FIRSTS, parts, strict=True)))
     t = 15 / 17
-    export(video, "obj", tmp_path / "mesh", times=[t])
+    write_pseudomesh(tmp_path / "mesh", video, [t])
     mesh = read_pseudomesh(tmp_path / "mesh")
     assert np.abs(mesh.frame(0).astype(int) - VideoRenderer(video).frame(t)).max() <= 1
-    export(video, "ply3dgs", tmp_path / "scene.ply", times=[t])
-    export(parts[2], "ply3dgs", tmp_path / "own.ply", times=[0.5])
+    write_3dgs_ply(tmp_path / "scene.ply", video, t)
+    write_3dgs_ply(tmp_path / "own.ply", parts[2], 0.5)
     assert (tmp_path / "scene.ply").read_bytes() == (tmp_path / "own.ply").read_bytes()
 
 

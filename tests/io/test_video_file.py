@@ -16,8 +16,6 @@ from PIL import Image
 from foldgauss.io import (
     Sound,
     VideoError,
-    index_video,
-    read_indexed,
     read_video,
     write_image,
     write_video,
@@ -124,14 +122,13 @@ def test_damaged_video_tells_what_was_promised(tmp_path):
     path.write_bytes(data)
     clip = read_video(path, size=(16, 32))
     assert 2 <= clip.num_frames < clip.num_declared == 132
-    with one_line(VideoError, "18:20", "of 132 frames decode"):
-        read_video(path, size=(16, 32), frames=(18, 20))
-    # What decodes past the damage is blemished, but in its place.
-    assert clip.notes[0] == f"only {clip.num_frames} of 132 frames decode; those are used."
-    assert clip.notes[1].startswith("7 frames, the first of them 17, are lost to damage and left out")
-    late = read_video(path, size=(16, 32), frames=(120, 130))
+    with one_line(VideoError, "126:128", "125 of 132 frames decode"):
+        read_video(path, size=(16, 32), frames=(126, 128))
+    assert clip.notes[0] == "only 125 of 132 frames decode; those are used."
+    assert any("damaged, and may show artifacts" in note for note in clip.notes)
+    late = read_video(path, size=(16, 32), frames=(113, 123))  # of those that decode
     assert late.num_frames == late.num_declared == 10
-    np.testing.assert_array_equal(late.frames, clip.frames[120 - 7 : 130 - 7])
+    np.testing.assert_array_equal(late.frames, clip.frames[113:123])
 
 
 # ----------------------------------------------------------------------------------- reading a folder
@@ -146,43 +143,14 @@ def test_folder_is_sorted_naturally(folder):
     assert read_video(folder, frames=(1, 3)).frames[:, 0, 0, 0].tolist() == [20, 90]
 
 
-@pytest.mark.parametrize("bits", [8, 10, 12, 14, 16])
-@pytest.mark.parametrize("kind", ["gray.png", "color.png", "alpha.png", "gray.tif", "folder"])
-def test_values_of_fewer_bits_in_images_of_16(tmp_path, kind, bits):
-    """As of cameras and microscopes: read as they are, with a note, or with the level of white."""
-    white, truth = (1 << bits) - 1, np.linspace(0, 255, 256).astype(np.uint8).reshape(16, 16)
-    image = np.rint(truth.astype(float) * white / 255).astype(np.uint16)
-    if kind not in ("gray.png", "gray.tif"):
-        image = np.stack([image] * 3 + [np.full_like(image, 65535)] * (kind == "alpha.png"), -1)
-    path = tmp_path / ("a.tif" if kind == "gray.tif" else "a.png")
-    assert cv2.imwrite(str(path), image)
-    if kind == "folder":
-        assert cv2.imwrite(str(tmp_path / "b.png"), 0 * image)  # without a note of its own
-        path = tmp_path
-    clip, index = read_video(path, levels=white), index_video(path, levels=white)
-    np.testing.assert_array_equal(clip.frames[0, ..., 1], truth)
-    np.testing.assert_array_equal(read_indexed(index, 0, 1).frames, clip.frames[:1])
-    assert (clip.notes, clip.reading.levels, index.reading.levels) == ((), white, white)
-    told = f"the largest value is {white:,} of 65,535, as in data of {bits} bits, which look dark; "
-    told += f"levels={white} (foldgauss fit --levels {white}) makes {white} white."
-    notes = read_video(path).notes
-    assert notes == index_video(path).notes == (() if bits == 16 else (told,))
-    if bits > 8:
-        assert read_video(path, levels=white // 2).notes[0].startswith(f"values of up to {white:,} are above levels=")
-
-
-@pytest.mark.parametrize("name", ["a.png", "a.jpg", "a.tif", "a.gif", "a.mkv"])
-def test_levels_of_clips_of_8_bits_are_refused(tmp_path, name):
-    if name in ("a.gif", "a.mkv"):
-        write_video(tmp_path / name, moving(2), 10)
-    else:
-        assert cv2.imwrite(str(tmp_path / name), moving(1)[0])
-    for reader in (read_video, index_video):
-        with one_line(VideoError, "levels: expected images or videos of 16 bits", name):
-            reader(tmp_path / name, levels=4095)
-    for levels in (0, 65536, 1.5, True):
-        with pytest.raises(VideoError, match="levels: expected the value of white"):
-            read_video(tmp_path / name, levels=levels)
+def test_gray_and_16_bit_images(tmp_path):
+    levels = np.arange(65536, dtype=np.uint16).reshape(256, 256)
+    cv2.imwrite(str(tmp_path / "0.png"), levels)
+    cv2.imwrite(str(tmp_path / "1.png"), np.repeat(levels[..., None], 3, 2))
+    frames = read_video(tmp_path).frames
+    expected = np.rint(levels / 257).astype(np.uint8)[..., None]
+    np.testing.assert_array_equal(frames[0], np.repeat(expected, 3, 2))
+    np.testing.assert_array_equal(frames[1], frames[0])
 
 
 @pytest.mark.parametrize(

@@ -39,9 +39,6 @@ class _Root(WithExamples, typer.core.TyperGroup):
         listed = {name: Command(name=name, help=entry.summary) for name, entry in COMMANDS.items()}
         self.commands = listed | dict(self.commands)
 
-    def list_commands(self, ctx) -> list[str]:
-        return list(self.commands)
-
     def resolve_command(self, ctx, args: list[str]) -> Any:
         self.commands |= load_commands(args[0])
         return super().resolve_command(ctx, args)

@@ -21,7 +21,12 @@ class WithExamples:
 
     def __init__(self, *arguments: Any, **options: Any):
         super().__init__(*arguments, **options)
-        _escape_help(self)
+        # Brackets are not markup here, and the source lines of paragraphs are joined.
+        paragraphs = inspect.cleandoc(self.help or "").split("\n\n")
+        self.help = escape("\n\n".join(" ".join(one.split()) for one in paragraphs))
+        for parameter in self.params:
+            if getattr(parameter, "help", None):
+                parameter.help = escape(parameter.help)
 
     def format_help(self, ctx, formatter) -> None:
         from typer import rich_utils  # only here: it imports a Markdown parser
@@ -29,9 +34,9 @@ class WithExamples:
         rich_utils.rich_format_help(obj=self, ctx=ctx, markup_mode="rich")
         console = Console(markup=False, highlight=False)
         console.print(" Examples", style="bold")
-        for example in EXAMPLES[ctx.command_path.partition(" ")[2]]:
-            console.print(f"   {example.purpose}:", style="dim")
-            console.print(f"     {example.line}", style="cyan", soft_wrap=True)
+        for purpose, line in EXAMPLES[ctx.command_path.partition(" ")[2]].items():
+            console.print(f"   {purpose}:", style="dim")
+            console.print(f"     {line}", style="cyan", soft_wrap=True)
 
 
 class Command(WithExamples, typer.core.TyperCommand):
@@ -60,12 +65,3 @@ class Command(WithExamples, typer.core.TyperCommand):
 def complete_choice(choices: Iterable[str]) -> Callable[[str], list[str]]:
     """Shell completion of one of the choices. Names of files are completed by the shell itself."""
     return lambda incomplete: [name for name in choices if name.startswith(incomplete)]
-
-
-def _escape_help(command: Any) -> None:
-    """Escape brackets, which are not markup here, and join the source lines of paragraphs."""
-    paragraphs = inspect.cleandoc(command.help or "").split("\n\n")
-    command.help = escape("\n\n".join(" ".join(one.split()) for one in paragraphs))
-    for parameter in command.params:
-        if getattr(parameter, "help", None):
-            parameter.help = escape(parameter.help)

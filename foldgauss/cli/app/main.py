@@ -5,7 +5,7 @@ import re
 import sys
 import warnings
 
-from foldgauss._runtime.checks import invalid
+from foldgauss._runtime.checks import invalid, require
 from foldgauss._runtime.interrupts import raise_on_sigterm
 from foldgauss.cli.app.application import Stopped, err, root_command, warn
 from foldgauss.cli.app.help import WrongUse
@@ -27,9 +27,14 @@ def _run(arguments: list[str] | None) -> None:
     arguments = sys.argv[1:] if arguments is None else arguments
     debug = "--debug" in arguments  # removed, so that it may be anywhere
     try:
-        if any(not argument or re.fullmatch("--[a-z-]+=", argument) for argument in arguments):
-            cure = "Leave it out, or set the shell variable that it stands for."  # a path would be the current folder
-            raise invalid("arguments", expected="a value for each", got="an empty one", cure=cure, kind=WrongUse)
+        require(
+            all(argument and not re.fullmatch("--[a-z-]+=", argument) for argument in arguments),
+            "arguments",
+            expected="a value for each",
+            got="an empty one",  # as a path it would be the current folder
+            cure="Leave it out, or set the shell variable that it stands for.",
+            kind=WrongUse,
+        )
         with warnings.catch_warnings():
             warnings.showwarning = _show_warning
             root_command()([argument for argument in arguments if argument != "--debug"], prog_name="foldgauss")

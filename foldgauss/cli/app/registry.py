@@ -12,13 +12,6 @@ class Command(NamedTuple):
     summary: str
 
 
-class Example(NamedTuple):
-    """A purpose, and the command line that serves it."""
-
-    purpose: str
-    line: str
-
-
 #: In the order in which users need them.
 COMMANDS: Mapping[str, Command] = MappingProxyType(
     {
@@ -46,116 +39,90 @@ COMMANDS: Mapping[str, Command] = MappingProxyType(
     }
 )
 
-#: Shown in the help, by the name of the command as it is typed; "" is `foldgauss` alone.
-EXAMPLES: Mapping[str, tuple[Example, ...]] = MappingProxyType(
+#: Purposes and the command lines that serve them, shown in the help, by the name of the command as it is typed; "" is
+#: `foldgauss` alone.
+EXAMPLES: Mapping[str, Mapping[str, str]] = MappingProxyType(
     {
-        "": (
-            Example("See what it does, on a sample clip", "foldgauss demo"),
-            Example("Fit a model to your own clip", "foldgauss fit holiday.mp4"),
-            Example("Install shell completion", "foldgauss --install-completion"),
-        ),
-        "fit": (
-            Example("All defaults, into holiday.fgz", "foldgauss fit holiday.mp4"),
-            Example("A quick draft of the first half second", "foldgauss fit holiday.mp4 --preset draft --frames 0:12"),
-            Example("A file of a given size", "foldgauss fit holiday.mp4 --size-mb 2"),
-            Example("Frames as images", "foldgauss fit frames/"),
-            Example(
-                "For slow motion above all",
-                "foldgauss fit holiday.mp4 --interpolation-fraction 0.3 --interpolation-end 1",
+        "": {
+            "See what it does, on a sample clip": "foldgauss demo",
+            "Fit a model to your own clip": "foldgauss fit holiday.mp4",
+            "Install shell completion": "foldgauss --install-completion",
+        },
+        "fit": {
+            "All defaults, into holiday.fgz": "foldgauss fit holiday.mp4",
+            "A quick draft of the first half second": "foldgauss fit holiday.mp4 --preset draft --frames 0:12",
+            "A file of a given size": "foldgauss fit holiday.mp4 --size-mb 2",
+            "Frames as images": "foldgauss fit frames/",
+            "For slow motion above all": "foldgauss fit holiday.mp4 --interpolation-fraction 0.3 --interpolation-end 1",
+            "A long clip, in segments of 10 seconds, with four processes": "foldgauss fit film.mp4 --workers 4",
+        },
+        "fit-many": {
+            "A model per clip, into holidays-models": "foldgauss fit-many holidays/",
+            "With four processes, at a small size; run it again to continue": (
+                "foldgauss fit-many holidays/ --out models --size 160x320 --workers 4"
             ),
-            Example(
-                "A long clip, in segments of 10 seconds, with four processes", "foldgauss fit film.mp4 --workers 4"
+        },
+        "demo": {
+            "Fit, render and evaluate the clip Bunny": "foldgauss demo --out first-look",
+        },
+        "render": {
+            "As a video, holiday.mp4": "foldgauss render holiday.fgz",
+            "At 100 frames per second": "foldgauss render holiday.fgz --fps 100",
+            "Slow motion as an animation": "foldgauss render holiday.fgz --speed 0.25 --out slow.gif",
+            "One image at twice the size": "foldgauss render holiday.fgz --times 0.5 --size 320x640 --out one.png",
+            "Lossless frames, in a folder": "foldgauss render holiday.fgz --out frames",
+            "Stabilized, into holiday.stable.mp4": "foldgauss render holiday.fgz --stabilize smooth",
+            "As from a tripod, borders filled from other frames": (
+                "foldgauss render holiday.fgz --stabilize fixed --border fill"
             ),
-        ),
-        "fit-many": (
-            Example("A model per clip, into holidays-models", "foldgauss fit-many holidays/"),
-            Example(
-                "With four processes, at a small size; run it again to continue",
-                "foldgauss fit-many holidays/ --out models --size 160x320 --workers 4",
+            "Without the moving object, into holiday.plate.mp4": "foldgauss render holiday.fgz --plate",
+            "Without the object of masks of your own": "foldgauss render holiday.fgz --plate --masks masks",
+        },
+        "view": {
+            "Play it in the browser": "foldgauss view holiday.fgz",
+            "Next to the clip": "foldgauss view holiday.fgz --original holiday.mp4",
+            "As a web page, to be sent or hosted": "foldgauss view holiday.fgz --out holiday.html",
+            "The page without a model, which opens model files": "foldgauss view --out index.html",
+        },
+        "evaluate": {
+            "PSNR and SSIM of every frame": "foldgauss evaluate holiday.fgz holiday.mp4",
+            "As JSON": "foldgauss evaluate holiday.fgz holiday.mp4 --json holiday.json",
+        },
+        "info": {
+            "Show the contents of the file": "foldgauss info holiday.fgz",
+        },
+        "edit": {
+            "With the script night.toml, into holiday.night.safetensors": "foldgauss edit holiday.fgz night.toml",
+            "Render the edited video directly": "foldgauss edit holiday.fgz night.toml --out night.mp4",
+        },
+        "compress": {
+            "Into holiday.fgz, without the clip": "foldgauss compress holiday.safetensors",
+            "Smaller, with the clip": "foldgauss compress holiday.safetensors holiday.mp4",
+            "With a quality": "foldgauss compress holiday.safetensors holiday.mp4 --quality 60",
+        },
+        "export": {
+            "For VeGaS, into holiday.ply": "foldgauss export holiday.fgz --format ply",
+            "One frame for a viewer of 3DGS scenes": (
+                "foldgauss export holiday.fgz --format ply3dgs --times 0.5 --out one.ply"
             ),
-        ),
-        "demo": (Example("Fit, render and evaluate the clip Bunny", "foldgauss demo --out first-look"),),
-        "render": (
-            Example("As a video, holiday.mp4", "foldgauss render holiday.fgz"),
-            Example("At 100 frames per second", "foldgauss render holiday.fgz --fps 100"),
-            Example(
-                "Slow motion as an animation",
-                "foldgauss render holiday.fgz --speed 0.25 --out slow.gif",
+            "Every frame as triangles, to edit elsewhere": "foldgauss export holiday.fgz --format obj --out mesh",
+            "The fourth segment as a model, film.3.safetensors": "foldgauss export film.fgz --format model --segment 3",
+        },
+        "import": {
+            "A VeGaS model, into video.safetensors": "foldgauss import video.ply",
+            "Frames edited as triangles, into mesh.mp4": "foldgauss import mesh/ --fps 24",
+        },
+        "uncertainty": {
+            "Tables and figures into steady-uncertainty, of a model that was fitted with --no-follow-camera": (
+                "foldgauss uncertainty steady.safetensors holiday.mp4"
             ),
-            Example(
-                "One image at twice the size",
-                "foldgauss render holiday.fgz --times 0.5 --size 320x640 --out one.png",
+            "With unknown colors": "foldgauss uncertainty steady.safetensors holiday.mp4 --level colors",
+        },
+        "tradeoff": {
+            "In ten minutes, into holiday-tradeoff": "foldgauss tradeoff holiday.mp4",
+            "Only time and degree, at a small size, in two minutes": (
+                "foldgauss tradeoff holiday.mp4 --axes time,degree --size 80x160 --minutes 2"
             ),
-            Example("Lossless frames, in a folder", "foldgauss render holiday.fgz --out frames"),
-            Example("Stabilized, into holiday.stable.mp4", "foldgauss render holiday.fgz --stabilize smooth"),
-            Example(
-                "As from a tripod, borders filled from other frames",
-                "foldgauss render holiday.fgz --stabilize fixed --border fill",
-            ),
-            Example("Without the moving object, into holiday.plate.mp4", "foldgauss render holiday.fgz --plate"),
-            Example("Without the object of masks of your own", "foldgauss render holiday.fgz --plate --masks masks"),
-        ),
-        "view": (
-            Example("Play it in the browser", "foldgauss view holiday.fgz"),
-            Example("Next to the clip", "foldgauss view holiday.fgz --original holiday.mp4"),
-            Example("As a web page, to be sent or hosted", "foldgauss view holiday.fgz --out holiday.html"),
-            Example("The page without a model, which opens model files", "foldgauss view --out index.html"),
-        ),
-        "evaluate": (
-            Example("PSNR and SSIM of every frame", "foldgauss evaluate holiday.fgz holiday.mp4"),
-            Example("As JSON", "foldgauss evaluate holiday.fgz holiday.mp4 --json holiday.json"),
-        ),
-        "info": (Example("Show the contents of the file", "foldgauss info holiday.fgz"),),
-        "edit": (
-            Example(
-                "With the script night.toml, into holiday.night.safetensors",
-                "foldgauss edit holiday.fgz night.toml",
-            ),
-            Example("Render the edited video directly", "foldgauss edit holiday.fgz night.toml --out night.mp4"),
-        ),
-        "compress": (
-            Example("Into holiday.fgz, without the clip", "foldgauss compress holiday.safetensors"),
-            Example("Smaller, with the clip", "foldgauss compress holiday.safetensors holiday.mp4"),
-            Example(
-                "With a quality",
-                "foldgauss compress holiday.safetensors holiday.mp4 --quality 60",
-            ),
-        ),
-        "export": (
-            Example("For VeGaS, into holiday.ply", "foldgauss export holiday.fgz --format ply"),
-            Example(
-                "One frame for a viewer of 3DGS scenes",
-                "foldgauss export holiday.fgz --format ply3dgs --times 0.5 --out one.ply",
-            ),
-            Example(
-                "Every frame as triangles, to edit elsewhere",
-                "foldgauss export holiday.fgz --format obj --out mesh",
-            ),
-            Example(
-                "The fourth segment as a model, film.3.safetensors",
-                "foldgauss export film.fgz --format model --segment 3",
-            ),
-        ),
-        "import": (
-            Example("A VeGaS model, into video.safetensors", "foldgauss import video.ply"),
-            Example("Frames edited as triangles, into mesh.mp4", "foldgauss import mesh/ --fps 24"),
-        ),
-        "uncertainty": (
-            Example(
-                "Tables and figures into steady-uncertainty, of a model that was fitted with --no-follow-camera",
-                "foldgauss uncertainty steady.safetensors holiday.mp4",
-            ),
-            Example(
-                "With unknown colors",
-                "foldgauss uncertainty steady.safetensors holiday.mp4 --level colors",
-            ),
-        ),
-        "tradeoff": (
-            Example("In ten minutes, into holiday-tradeoff", "foldgauss tradeoff holiday.mp4"),
-            Example(
-                "Only time and degree, at a small size, in two minutes",
-                "foldgauss tradeoff holiday.mp4 --axes time,degree --size 80x160 --minutes 2",
-            ),
-        ),
+        },
     }
 )

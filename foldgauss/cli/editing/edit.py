@@ -69,7 +69,8 @@ def edit_command(
     check(out_path, overwrite, inputs)
     model, about = load_video_model(model_path), read_origin(model_path)
     refuse_huge(image_size or model.size)
-    output = Output(out_path, model.fps, overwrite, sound=choose_sound(sound, Timeline(), about, model.fps))
+    sounding = choose_sound(sound, Timeline(), about, model.fps)
+    output = Output(out_path, model.fps, overwrite, encoding={"sound": sounding})
     if not as_model:
         output.check(image_size or model.size, model.num_frames)
     with print_log():

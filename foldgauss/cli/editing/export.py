@@ -8,7 +8,7 @@ import typer
 from foldgauss._runtime.checks import check_one_of, require
 from foldgauss.cli.app.application import command, out
 from foldgauss.cli.app.help import complete_choice
-from foldgauss.cli.shared.arguments import ModelFile, Overwrite, Size, Times, parse_size, parse_times
+from foldgauss.cli.shared.arguments import ModelFile, Overwrite, Size, parse_size, parse_times
 from foldgauss.cli.shared.console import format_count, progress_bar
 from foldgauss.cli.shared.files import (
     Video,
@@ -21,9 +21,9 @@ from foldgauss.cli.shared.files import (
 )
 from foldgauss.cli.shared.rendering import Output
 from foldgauss.io._atomic import write_or_keep
-from foldgauss.io.exchange.export import export
-from foldgauss.io.exchange.pseudomesh import read_pseudomesh
-from foldgauss.io.exchange.vegas_ply import read_vegas_ply
+from foldgauss.io.exchange.gaussians_ply import write_3dgs_frames, write_3dgs_ply
+from foldgauss.io.exchange.pseudomesh import read_pseudomesh, write_pseudomesh
+from foldgauss.io.exchange.vegas_ply import read_vegas_ply, write_vegas_ply, write_vegas_segments
 from foldgauss.io.media.writing import VIDEO_SUFFIXES
 from foldgauss.io.models.video_model import (
     MODEL_SUFFIX,
@@ -62,7 +62,12 @@ def export_command(
             "also for ply of a model in segments [default: by the model's name].",
         ),
     ] = None,
-    times: Times = None,
+    times: Annotated[
+        str | None,
+        typer.Option(
+            metavar="T,T,..|A:B:N", help="Times in [0, 1], or N times from A to B [default: those of the frames]."
+        ),
+    ] = None,
     overwrite: Overwrite = False,
 ) -> None:
     """Write a model for other programs, or a part of it as a model.
@@ -100,6 +105,13 @@ def export_command(
         expected=f"a name ending in {suffix}" if suffix else "a folder without extension",
         got=out_path,
     )
+    require(
+        file_format != "ply3dgs" or single or out_path.suffix.lower() != ".ply" or out_path.is_dir(),
+        "--times",
+        expected="one for a single file",
+        got="all frames" if chosen is None else len(chosen),
+        cure="Give one time, or a folder (a name without .ply).",
+    )
     refuse_inputs(out_path, {"model": model_path})
     if not out_path.is_dir():
         refuse_existing(out_path, overwrite)
@@ -108,8 +120,15 @@ def export_command(
     def write(path: Path) -> Path:
         if file_format == "model":
             return save_video_model(path, model, metadata=about)
-        with progress_bar("Writing", num_frames, shown=file_format != "ply") as advance:
-            return export(model, file_format, path, times=chosen, overwrite=overwrite, on_frame=advance)
+        if file_format == "ply" and not suffix:
+            return write_vegas_segments(path, model, overwrite=overwrite)
+        if file_format == "ply":
+            return write_vegas_ply(path, model)
+        if path.suffix.lower() == ".ply" and not path.is_dir():
+            return write_3dgs_ply(path, model, float(chosen[0]))
+        write_frames = {"ply3dgs": write_3dgs_frames, "obj": write_pseudomesh}[file_format]
+        with progress_bar("Writing", num_frames) as advance:
+            return write_frames(path, model, chosen, overwrite=overwrite, on_frame=advance)
 
     path = write_or_keep(out_path, write)
     most = "" if file_format in ("model", "ply") else "up to "  # a frame has only its live Gaussians
@@ -129,7 +148,7 @@ def _take_segment(video: Video, about: dict[str, Any], number: int) -> tuple[Vid
     )
     segment = video.segments[number]
     begins = (about.get("frames") or [0])[0] or 0
-    known = keep_origin(about, "clip", "reading", "stretched")
+    known = keep_origin(about, "clip")
     known |= {"frames": [begins + segment.first, begins + segment.stop]} | dict(segment.metadata)
     seconds = read_frame_seconds(about, video.num_frames)
     if seconds is not None:  # the segment's own frames may be evenly spaced, at another rate than the whole clip's

@@ -28,9 +28,7 @@ from foldgauss.cli.fitting.options import (
 )
 from foldgauss.cli.fitting.segments import describe_plan, fit_in_segments, plan_gaussians, print_plan
 from foldgauss.cli.shared.arguments import (
-    Deinterlace,
     Frames,
-    Levels,
     NewClip,
     Overwrite,
     Size,
@@ -47,7 +45,7 @@ from foldgauss.cli.shared.fit_progress import (
 from foldgauss.cli.shared.rendering import evaluate_with_progress
 from foldgauss.io import HistoryFile, read_history, write_curves
 from foldgauss.io._atomic import lock_output, resolve
-from foldgauss.io.media.clip import DEINTERLACE, Clip, check_reading
+from foldgauss.io.media.clip import Clip
 from foldgauss.io.models.compact import COMPACT_SUFFIX
 from foldgauss.io.models.video_model import MODEL_SUFFIX, check_model_name
 from foldgauss.jobs import FitJob
@@ -77,8 +75,6 @@ def fit(
     ] = None,
     size: Size = None,
     frames: Frames = None,
-    levels: Levels = None,
-    deinterlace: Deinterlace = DEINTERLACE[0],
     overwrite: Overwrite = False,
     history: Annotated[
         Path | None,
@@ -113,7 +109,6 @@ def fit(
         config,
         parse_size(size),
         parse_frames(frames),
-        reading=check_reading(deinterlace, levels),
         checkpoint_seconds=checkpoint_seconds,
     )
     display = choose_display(quiet, log_json)

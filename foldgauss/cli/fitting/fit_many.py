@@ -10,7 +10,7 @@ import typer
 
 from foldgauss._runtime.checks import ParameterError, require
 from foldgauss.cli.app.application import command, out, warn
-from foldgauss.cli.fitting.job_progress import emit_json, run_jobs
+from foldgauss.cli.fitting.job_progress import run_jobs
 from foldgauss.cli.fitting.options import (
     CheckpointSeconds,
     LogJson,
@@ -23,9 +23,7 @@ from foldgauss.cli.fitting.options import (
 )
 from foldgauss.cli.fitting.segments import print_failures
 from foldgauss.cli.shared.arguments import (
-    Deinterlace,
     Frames,
-    Levels,
     Overwrite,
     Size,
     parse_frames,
@@ -33,8 +31,8 @@ from foldgauss.cli.shared.arguments import (
 )
 from foldgauss.cli.shared.console import choose_display, format_count, write_json
 from foldgauss.cli.shared.files import make_folder
+from foldgauss.cli.shared.fit_progress import print_json
 from foldgauss.io._atomic import lock_output, resolve
-from foldgauss.io.media.clip import DEINTERLACE, check_reading
 from foldgauss.jobs import FitJob, Outcome, find_clips, make_jobs
 from foldgauss.jobs.job import RECORDS, read_record, read_request, write_request
 from foldgauss.video.fitting.config import DEFAULT_QUALITY, FitConfig
@@ -70,8 +68,6 @@ def fit_many(
     ] = None,
     size: Size = None,
     frames: Frames = None,
-    levels: Levels = None,
-    deinterlace: Deinterlace = DEINTERLACE[0],
     overwrite: Overwrite = False,
     checkpoint_seconds: CheckpointSeconds = None,
     workers: Workers = None,
@@ -107,7 +103,6 @@ def fit_many(
         size=parse_size(size),
         frames=parse_frames(frames),
         checkpoint_seconds=checkpoint_seconds,
-        reading=check_reading(deinterlace, levels),
     )
     _prepare_outputs(jobs, overwrite)
     before = sum(read_record(job) is not None for job in jobs)
@@ -128,7 +123,7 @@ def fit_many(
         outcomes = run_jobs(jobs, "clips", display, client, overwrite=overwrite, on_end=on_end)
     failed = [outcome for outcome in outcomes if outcome.failure is not None]
     if display == "json":
-        emit_json("done", {"summary": str(out_dir / SUMMARY), "done": len(jobs) - len(failed), "failed": len(failed)})
+        print_json("done", {"summary": str(out_dir / SUMMARY), "done": len(jobs) - len(failed), "failed": len(failed)})
     elif display != "quiet":
         done = [outcome.record for outcome in outcomes if outcome.failure is None]
         text = f"{format_count(len(done), 'model')} in {out_dir}"

@@ -1,7 +1,6 @@
 """Runs jobs and displays their progress: a bar, lines in a log, or JSON."""
 
 from collections.abc import Callable, Sequence
-from contextlib import suppress
 from typing import Any
 
 from foldgauss.cli.app.application import Stopped, err
@@ -15,12 +14,6 @@ from foldgauss.video import Evaluation, FitConfig, FitInfo
 
 #: Up to so many jobs, each has a line in a log.
 MAX_LINES = 20
-
-
-def emit_json(event: str, figures: dict[str, Any]) -> None:
-    """Print a line of JSON; a closed standard output must not end the fits."""
-    with suppress(OSError):
-        print_json(event, figures)
 
 
 def describe_continuation(overwrite: bool) -> str:
@@ -47,7 +40,7 @@ def summarize_fit(scores: Evaluation, records: Sequence[dict[str, Any]], config:
 def report_fit(display: Display, target: str, figures: dict[str, Any]) -> None:
     """Print the results of a fit, the model `target`."""
     if display == "json":
-        emit_json("done", {"model": target} | figures)
+        print_json("done", {"model": target} | figures)
     elif display != "quiet":
         print_figures(target, figures)
 
@@ -101,7 +94,7 @@ class _View:
     def update(self, name: str, info: FitInfo) -> None:
         self.running[name] = info
         if self.display == "json":
-            emit_json("progress", {"name": name} | info_line(info))
+            print_json("progress", {"name": name} | info_line(info))
         self._show()
 
     def end(self, outcome: Outcome) -> None:
@@ -110,10 +103,10 @@ class _View:
         self.done += outcome.failure is None
         self.failed += outcome.failure is not None
         if self.display == "json" and outcome.failure is not None:
-            emit_json("failed", {"name": name, "reason": outcome.failure})
+            print_json("failed", {"name": name, "reason": outcome.failure})
         elif self.display == "json":
             figures = {name: outcome.record[name] for name in ("mean_psnr", "mean_ssim", "seconds", "steps")}
-            emit_json("ended", {"name": name} | figures)
+            print_json("ended", {"name": name} | figures)
         elif self.display == "lines" and self.total <= MAX_LINES:
             result = "failed" if outcome.failure is not None else f"{outcome.record['mean_psnr']:.2f} dB"
             err.print(f"{self._counts()}: {name}, {result}", soft_wrap=True)

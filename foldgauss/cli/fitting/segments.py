@@ -10,13 +10,13 @@ from typing import Any
 from foldgauss.cli.app.application import Stopped, err, out, warn
 from foldgauss.cli.fitting.job_progress import (
     describe_continuation,
-    emit_json,
     report_fit,
     run_jobs,
     summarize_fit,
 )
 from foldgauss.cli.fitting.options import WorkerOptions
 from foldgauss.cli.shared.console import Display, format_count, progress_bar, show_status
+from foldgauss.cli.shared.fit_progress import print_json
 from foldgauss.io._atomic import write_or_keep
 from foldgauss.io.media.reading import describe_crop
 from foldgauss.jobs import FitJob, LongFit, Outcome, plan_long_fit
@@ -45,7 +45,6 @@ def fit_in_segments(
                 frames=job.frames,
                 segment_seconds=segment_seconds,
                 checkpoint_seconds=job.checkpoint_seconds,
-                reading=job.reading,
                 restart=overwrite,
             )
         _print_plan(fit, job.config, display, Path(job.clip), options)
@@ -98,7 +97,7 @@ def print_plan(display: Display, source: str, num_frames: int, size: tuple[int, 
     """Print the clip and what is planned for it, or `about` it as JSON."""
     height, width = size
     if display == "json":
-        emit_json("start", {"clip": source, "num_frames": num_frames, "height": height, "width": width} | about)
+        print_json("start", {"clip": source, "num_frames": num_frames, "height": height, "width": width} | about)
     elif display != "quiet":
         out.print(f"{source}: {format_count(num_frames, 'frame')} of {height}x{width}{plan}", soft_wrap=True)
 

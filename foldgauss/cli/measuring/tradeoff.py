@@ -16,15 +16,15 @@ from foldgauss import __version__
 from foldgauss._runtime.checks import ParameterError, check_within, invalid, require
 from foldgauss._runtime.machine import describe_machine
 from foldgauss._runtime.settings import setting_of, settings_by_name, walk
-from foldgauss.analysis.plot import Panel
+from foldgauss.analysis.plot import Panel, plot_tradeoff
 from foldgauss.cli.app.application import command, err, out, warn
 from foldgauss.cli.fitting.job_progress import run_jobs
-from foldgauss.cli.shared.arguments import Deinterlace, Frames, Levels, NewClip, Size, parse_frames, parse_size
+from foldgauss.cli.shared.arguments import Frames, NewClip, Size, parse_frames, parse_size
 from foldgauss.cli.shared.console import choose_display, show_status, write_json
 from foldgauss.cli.shared.files import make_folder, name_after, refuse_foreign
 from foldgauss.io._atomic import lock_output, write_or_keep
-from foldgauss.io.figures import write_tradeoff
-from foldgauss.io.media.clip import DEINTERLACE, Clip, Reading, check_reading
+from foldgauss.io.figures import write_figure
+from foldgauss.io.media.clip import Clip
 from foldgauss.io.media.reading import read_video
 from foldgauss.io.models.compact import COMPACT_SUFFIX
 from foldgauss.io.models.video_model import MODEL_SUFFIX, load_video_model
@@ -40,7 +40,6 @@ from foldgauss.video.tradeoff import (
     AXES,
     LEAST_STEPS,
     Point,
-    Skipped,
     Throughput,
     check_axes,
     estimate_seconds,
@@ -77,47 +76,35 @@ COSTS = {
 }
 
 
-@dataclasses.dataclass
-class Record:
-    """The results, in `path`: the settings, the plan and, in the end, a row for each measured point.
+def open_record(path: Path, settings: dict[str, Any], *, restart: bool = False) -> dict[str, Any]:
+    """The results to be written to `path`: the settings, the machine, the plan and, in the end, a row for each measured
+    point by its name.
 
-    The fits themselves have records of their own, so that finished ones are not repeated.
-
-    Raises ParameterError if `path` has results of other settings or is not a record.
+    Machine and plan are those in `path`, unless `restart`. The fits have records of their own, so that finished ones
+    are not repeated. Raises ParameterError if `path` has results of other settings or is not a record.
     """
+    record = {"settings": settings, "machine": describe_machine()}
+    record |= {name: {} for name in ("plan", "left_out", "fronts", "points")}
+    if restart or not path.exists():
+        return record
+    cure = "Choose another folder, or start over with --overwrite."
+    try:
+        kept = json.loads(path.read_text())
+        before, known = dict(kept["settings"]), {name: dict(kept[name]) for name in ("plan", "machine")}
+    except (ValueError, KeyError, TypeError, RecursionError) as error:
+        raise invalid(
+            "--out", expected=f"results of `foldgauss tradeoff` in {path}", got=f"something else ({error})", cure=cure
+        ) from error
+    changed = sorted(name for name in settings if before.get(name) != settings[name])
+    if changed:
+        text = ", ".join(f"{name} was {before.get(name)!r}, is {settings[name]!r}" for name in changed)
+        raise ParameterError("--out", f"{path} holds results of other settings: {text}. {cure}")
+    return record | known
 
-    path: Path
-    settings: dict[str, Any]
-    restart: bool = False
-    plan: dict[str, Any] = dataclasses.field(default_factory=dict)
-    rows: dict[str, dict[str, Any]] = dataclasses.field(default_factory=dict)
-    fronts: dict[str, Any] = dataclasses.field(default_factory=dict)
-    left_out: dict[str, str] = dataclasses.field(default_factory=dict)
-    machine: dict[str, Any] = dataclasses.field(default_factory=describe_machine)
 
-    def __post_init__(self) -> None:
-        if not self.path.exists() or self.restart:
-            return
-        cure = "Choose another folder, or start over with --overwrite."
-        try:
-            kept = json.loads(self.path.read_text())
-            before, self.plan, self.machine = dict(kept["settings"]), dict(kept["plan"]), dict(kept["machine"])
-        except (ValueError, KeyError, TypeError, RecursionError) as error:
-            raise invalid(
-                "--out",
-                expected=f"results of `foldgauss tradeoff` in {self.path}",
-                got=f"something else ({error})",
-                cure=cure,
-            ) from error
-        changed = sorted(name for name in self.settings if before.get(name) != self.settings[name])
-        if changed:
-            text = ", ".join(f"{name} was {before.get(name)!r}, is {self.settings[name]!r}" for name in changed)
-            raise ParameterError("--out", f"{self.path} holds results of other settings: {text}. {cure}")
-
-    def save(self) -> None:
-        names = ("settings", "machine", "plan", "left_out", "fronts")
-        kept = {name: getattr(self, name) for name in names} | {"points": list(self.rows.values())}
-        write_or_keep(self.path, lambda path: write_json(path, kept))
+def save_record(path: Path, record: dict[str, Any]) -> None:
+    kept = record | {"points": list(record["points"].values())}
+    write_or_keep(path, lambda path: write_json(path, kept))
 
 
 def file_name(point: Point) -> str:
@@ -126,32 +113,22 @@ def file_name(point: Point) -> str:
     return point.name.replace(", ", "-").replace(" ", "-").replace("/", "_") + suffix
 
 
-def format_command(
-    video: Path, size: str | None, frames: str | None, reading: Reading, folder: Path, point: Point
-) -> str:
+def format_command(video: Path, size: str | None, frames: str | None, folder: Path, point: Point) -> str:
     """The command line that fits the model of `point`, or evaluates that of the base, from the current folder."""
     if point.played is not None:
-        words = [
-            "evaluate",
-            str(folder / MODELS / f"base{MODEL_SUFFIX}"),
-            str(video),
-            *_options(point.played, point.config.options),
-        ]
-        return shlex.join(["foldgauss", *words])
-    words = ["fit", str(video), "--out", file_name(point)]
-    words += [] if size is None else ["--size", size]
-    words += [] if frames is None else ["--frames", frames]
-    words += [f"--{name}={value}" for name, value in reading.changed.items()]
-    default = FitConfig()
+        words = ["evaluate", str(folder / MODELS / f"base{MODEL_SUFFIX}"), str(video)]
+        return shlex.join(["foldgauss", *words, *_options(point.played, point.config.options)])
+    default, words = FitConfig(), ["fit", str(video), "--out", file_name(point)]
+    for option, value in (("--size", size), ("--frames", frames)):
+        words += [] if value is None else [option, value]
     words += [*_options(point.config, default), *_options(point.config.options, default.options)]
     return shlex.join(["foldgauss", *words])
 
 
 def _options(now: FitConfig | RenderOptions, before: FitConfig | RenderOptions) -> list[str]:
     """Command-line options for all fields that differ."""
-    words = []
+    fields, words = {name: field for name, field, _ in walk(now)}, []
     for name, value in _changed(now, before).items():
-        fields = {name: field for name, field, _ in walk(now)}
         option = setting_of(fields[name]).option if isinstance(now, FitConfig) else f"--{name.replace('_', '-')}"
         on, _, off = option.partition("/")
         words += [on if value else off] if off else [on, str(value)]
@@ -170,10 +147,10 @@ def changed_settings(point: Point, base: FitConfig) -> dict[str, Any]:
     return _changed(point.config, base) | others
 
 
-def report(record: Record, made: list[Point], skipped: list[Skipped]) -> None:
+def report(folder: Path, record: dict[str, Any], made: list[Point]) -> None:
     """Write and print the Pareto fronts and their knees."""
-    names, folder = [point.name for point in made], record.path.parent
-    rows = [record.rows[name] for name in names]
+    names, fronts = [point.name for point in made], record["fronts"]
+    rows = [record["points"][name] for name in names]
     quality, panels = [row["psnr"] for row in rows], []
     for name, cost in COSTS.items():
         amounts = [row[cost.column] for row in rows]
@@ -182,21 +159,24 @@ def report(record: Record, made: list[Point], skipped: list[Skipped]) -> None:
         place = knee([costs[k] for k in front], [quality[k] for k in front])  # on the front
         at = None if place is None else front[place]
         panels.append(Panel(cost.label, amounts, front, at))
-        record.fronts[name] = {"what": cost.what, "column": cost.column, "front": [names[k] for k in front]}
-        record.fronts[name]["knee"] = None if at is None else names[at]
-    record.left_out = {one.name: one.why for one in skipped}
-    record.save()
-    marks = [[cost for cost in COSTS if name in record.fronts[cost]["front"]] for name in names]
+        fronts[name] = {"what": cost.what, "column": cost.column, "front": [names[k] for k in front]}
+        fronts[name]["knee"] = None if at is None else names[at]
+    save_record(folder / RECORD, record)
+    points = [(point.axis, point.value) for point in made]
     try:
-        write_tradeoff(folder / PLOT, panels, quality, [(point.axis, point.value) for point in made])
+        write_figure(
+            folder / PLOT,
+            lambda figure: plot_tradeoff(panels, quality, points, figure.subplots(1, len(panels), sharey=True)),
+            (5.5 * len(panels), 6.5),
+        )
     except ImportError as error:
         warn(f"no plot in {folder / PLOT}: {error}")
+    marks = [[cost for cost in COSTS if name in fronts[cost]["front"]] for name in names]
     _print_rows(rows, names, marks)
     for name, cost in COSTS.items():
-        at, front = record.fronts[name]["knee"], "; ".join(record.fronts[name]["front"])
-        text = f"no knee; the Pareto front is {front}"
+        at, text = fronts[name]["knee"], f"no knee; the Pareto front is {'; '.join(fronts[name]['front'])}"
         if at is not None:
-            row = record.rows[at]
+            row = record["points"][at]
             text = f"the knee is {at}, {row['psnr']:.2f} dB with {cost.form.format(row[cost.column])}"
         out.print(f"PSNR against {cost.what}: {text}", soft_wrap=True)
     out.print("Commands of the points on the Pareto fronts:")
@@ -247,8 +227,6 @@ def tradeoff_command(
     ] = None,
     size: Size = None,
     frames: Frames = None,
-    levels: Levels = None,
-    deinterlace: Deinterlace = DEINTERLACE[0],
     seed: Annotated[int, typer.Option(help="Seed of all fits.")] = 0,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Discard earlier results.")] = False,
 ) -> None:
@@ -263,8 +241,7 @@ def tradeoff_command(
     out_dir = name_after(video, "-tradeoff") if out_dir is None else out_dir
     known = overwrite or (out_dir / RECORD).exists()
     refuse_foreign(out_dir, FILES, "tradeoff", record=RECORD, known=known, cure=", or start over with --overwrite")
-    reading = check_reading(deinterlace, levels)
-    clip = read_video(video, frames=parse_frames(frames), size=parse_size(size), **reading._asdict())
+    clip = read_video(video, frames=parse_frames(frames), size=parse_size(size))
     for text in clip.notes:
         warn(f"{clip.source}: {text}")
     make_folder(out_dir)
@@ -272,10 +249,12 @@ def tradeoff_command(
     make_folder(out_dir / MODELS)
     settings = {"axes": list(chosen), "minutes": None if steps else minutes, "steps": steps, "seed": seed}
     source = fingerprint(clip)
-    record = Record(out_dir / RECORD, settings | {"version": __version__} | source, restart=overwrite)
+    record = open_record(out_dir / RECORD, settings | {"version": __version__} | source, restart=overwrite)
     base = _plan_base(clip, record, wanted, chosen, minutes, steps)
+    save_record(out_dir / RECORD, record)
     points, skipped = plan_points(base, chosen, clip.num_frames, has_alpha=clip.has_alpha)
     for one in skipped:
+        record["left_out"][one.name] = one.why
         err.print(f"note: {one.name} is left out: {one.why}.", soft_wrap=True)
     fits = {point.name: point for point in points if point.played is None}
     jobs = [
@@ -286,7 +265,6 @@ def tradeoff_command(
             point.config,
             parse_size(size),
             parse_frames(frames),
-            reading=reading,
             source=source,
         )
         for name, point in fits.items()
@@ -299,21 +277,21 @@ def tradeoff_command(
     for outcome in outcomes:
         if outcome.failure is not None:
             require(outcome.job.name != "base", "base", expected="a fit of the base", got=outcome.failure)
-            skipped.append(Skipped(outcome.job.name, outcome.failure))
+            record["left_out"][outcome.job.name] = outcome.failure
             err.print(f"{outcome.job.name} is left out: {outcome.failure}", soft_wrap=True)
     with show_status("Measuring"):
         _measure(points, base, {outcome.job.name: outcome for outcome in outcomes}, clip, record)
-    for point in points:
-        if point.name in record.rows:
-            record.rows[point.name]["command"] = format_command(video, size, frames, reading, out_dir, point)
-    report(record, [point for point in points if point.name in record.rows], skipped)
+    made = [point for point in points if point.name in record["points"]]
+    for point in made:
+        record["points"][point.name]["command"] = format_command(video, size, frames, out_dir, point)
+    report(out_dir, record, made)
 
 
 def _plan_base(
-    clip: Clip, record: Record, wanted: FitConfig, axes: tuple[str, ...], minutes: float, steps: int | None
+    clip: Clip, record: dict[str, Any], wanted: FitConfig, axes: tuple[str, ...], minutes: float, steps: int | None
 ) -> FitConfig:
     """Choose the number of steps that the minutes allow; measures the throughput unless it is recorded."""
-    if not record.plan:
+    if not record["plan"]:
         full, lifetime = planned_steps(wanted, clip.num_frames), TYPICAL_LIFETIME
         with show_status("Measuring the throughput"):
             if wanted.num_gaussians is None and wanted.follows_motion:
@@ -327,8 +305,8 @@ def _plan_base(
         least = max(LEAST_STEPS, clip.num_frames)  # so that the base sees every frame
         chosen = min(max(allowed, least), full) if steps is None else steps
         expected = MARGIN * estimate_seconds(points, chosen, throughput) / 60
-        record.plan |= {"num_gaussians": num, "steps": chosen, "pace": throughput._asdict()}
-        record.plan |= {"expected_minutes": round(expected, 2)}
+        record["plan"] = {"num_gaussians": num, "steps": chosen, "pace": throughput._asdict()}
+        record["plan"]["expected_minutes"] = round(expected, 2)
         out.print(
             f"{clip.source}: {clip.num_frames} frames of {clip.size[0]}x{clip.size[1]}; "
             f"{len(points)} points around a base of {chosen:,} steps, about {expected:.1f} minutes",
@@ -340,8 +318,7 @@ def _plan_base(
                 f"the fewest allowed: this takes about {expected:.1f}. Choose fewer --axes or --frames, or a "
                 "smaller --size."
             )
-    record.save()
-    return dataclasses.replace(wanted, num_gaussians=record.plan["num_gaussians"], steps=record.plan["steps"])
+    return dataclasses.replace(wanted, **{name: record["plan"][name] for name in ("num_gaussians", "steps")})
 
 
 def _measure_throughput(clip: Clip, config: FitConfig) -> Throughput:
@@ -356,7 +333,9 @@ def _measure_throughput(clip: Clip, config: FitConfig) -> Throughput:
     return Throughput(max(first.seconds - step, 0.0), step, evaluation)
 
 
-def _measure(points: list[Point], base: FitConfig, outcomes: dict[str, Outcome], clip: Clip, record: Record) -> None:
+def _measure(
+    points: list[Point], base: FitConfig, outcomes: dict[str, Outcome], clip: Clip, record: dict[str, Any]
+) -> None:
     """Fill the rows of the record: of each fit its results, and of each point the speed of rendering."""
     reference = load_video_model(outcomes["base"].job.target)
     rate = measure_frame_rate(reference)
@@ -372,7 +351,7 @@ def _measure(points: list[Point], base: FitConfig, outcomes: dict[str, Outcome],
             quality = {"psnr": round(scores.mean_psnr, 3), "ssim": round(scores.mean_ssim, 4)}
         # Relative to the base, measured at the same time, under the same load.
         own, others = measure_frame_seconds(shown, reference)
-        record.rows[point.name] = {
+        record["points"][point.name] = {
             "axis": point.axis,
             "value": point.value,
             "settings": changed_settings(point, base),

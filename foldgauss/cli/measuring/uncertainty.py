@@ -1,6 +1,5 @@
 """The command `uncertainty`."""
 
-import csv
 import dataclasses
 from collections.abc import Callable
 from pathlib import Path
@@ -24,6 +23,7 @@ from foldgauss.cli.shared.files import (
     refuse_segments,
 )
 from foldgauss.io._atomic import atomic_path, lock_output, translate_output_errors, write_or_keep
+from foldgauss.io.figures import write_figure
 from foldgauss.io.models.video_model import load_video_model, read_origin
 from foldgauss.uncertainty import frame_time_posterior, likelihood_profiles, marginalize_colors
 from foldgauss.uncertainty.diagnostics import plots
@@ -129,7 +129,9 @@ def uncertainty_command(
             on_frame = lambda done, total: show("Integrating colors", done, total)  # noqa: E731
             profiles = marginalize_colors(model, clip.frames, profiles, on_frame=on_frame)
         settings = {"concentration": concentration, "ensembles": ensembles, "steps": steps, "seed": seed}
-        posterior = _sample(out_dir / CHAINS, overwrite, show, profiles=profiles, **settings)
+        if overwrite:
+            (out_dir / CHAINS).unlink(missing_ok=True)
+        posterior = _sample(out_dir / CHAINS, show, profiles=profiles, **settings)
     fitted = np.asarray(model.frame_times.times(), np.float64) if model.num_frames == clip.num_frames else None
     title = f"{model_path.name}, by {Path(clip.source).name}"
     written = write_or_keep(out_dir, lambda folder: _write(folder, posterior, fitted, title))
@@ -138,8 +140,8 @@ def uncertainty_command(
         warn(f"{posterior.message} The draws so far are in {written}.")
 
 
-def _sample(path: Path, overwrite: bool, show: Callable, **arguments: Any) -> FrameTimePosterior:
-    """Sample, from the draws of a stopped run if there are any; with `overwrite`, draws of another run are replaced."""
+def _sample(path: Path, show: Callable, **arguments: Any) -> FrameTimePosterior:
+    """Sample, from the draws of a stopped run if there are any."""
     existed, sampled = path.exists(), False
 
     def on_steps(done: int, total: int) -> None:
@@ -153,15 +155,12 @@ def _sample(path: Path, overwrite: bool, show: Callable, **arguments: Any) -> Fr
     except ParameterError as error:
         if error.parameter != "backend":
             raise
-        if not overwrite:
-            raise invalid(
-                "--out",
-                expected="the draws of this model, clip and settings",
-                got=f"others in {path}, or damaged ones",
-                cure="Choose another folder, or add --overwrite.",
-            ) from error
-        path.unlink()
-        return _sample(path, overwrite, show, **arguments)
+        raise invalid(
+            "--out",
+            expected="the draws of this model, clip and settings",
+            got=f"others in {path}, or damaged ones",
+            cure="Choose another folder, or add --overwrite.",
+        ) from error
     except KeyboardInterrupt as error:
         raise Stopped(f"stopped; the same command continues from {path}.") from error
     if existed:
@@ -174,43 +173,30 @@ def _write(folder: Path, posterior: FrameTimePosterior, fitted: np.ndarray | Non
     """Write all files, each atomically, the most important ones first; returns the folder."""
     folder.mkdir(parents=True, exist_ok=True)
     flagged = irregularities(posterior)
-    _write_table(folder / "frame_times.csv", frame_table(posterior, fitted))
+    columns = frame_table(posterior, fitted)
+    with atomic_path(folder / "frame_times.csv") as temporary:
+        rows, header = np.stack([*columns.values()], axis=1), ",".join(columns)
+        np.savetxt(temporary, rows, fmt="%.9g", delimiter=",", header=header, comments="")
     with atomic_path(folder / "summary.md") as temporary:
         text = summary(posterior, fitted, flagged=flagged)
         temporary.write_text(f"# Frame times of {title}\n\n{text}")
     _write_netcdf(folder / "posterior.nc", posterior)
-    _save_plot(folder / "times.png", plots.plot_times, posterior, fitted=fitted, flagged=flagged)
-    _save_plot(folder / "increments.png", plots.plot_increments, posterior, flagged=flagged)
-    _save_plot(folder / "correlation.png", plots.plot_correlation, posterior.profiles)
+    write_figure(
+        folder / "times.png",
+        lambda figure: plots.plot_times(posterior, figure.subplots(2, 1, sharex=True), fitted=fitted, flagged=flagged),
+        (9, 6),
+    )
+    write_figure(
+        folder / "increments.png",
+        lambda figure: plots.plot_increments(posterior, figure.subplots(), flagged=flagged),
+        (9, 4),
+    )
+    write_figure(
+        folder / "correlation.png",
+        lambda figure: plots.plot_correlation(posterior.profiles, figure.subplots()),
+        (6, 3.6),
+    )
     return folder
-
-
-def _save_plot(path: Path, plot: Callable, *arguments: Any, **options: Any) -> None:
-    from matplotlib import pyplot
-
-    pyplot.switch_backend("Agg")  # needs no display
-    figure = np.ravel(plot(*arguments, **options))[0].figure
-    try:
-        with atomic_path(path) as temporary:
-            figure.savefig(temporary, format="png", dpi=120)
-    finally:
-        pyplot.close(figure)
-
-
-def _write_table(path: Path, columns: dict[str, np.ndarray]) -> None:
-    with atomic_path(path) as temporary, open(temporary, "w", newline="") as file:
-        writer = csv.writer(file)
-        writer.writerow(columns)
-        for row in zip(*columns.values(), strict=True):
-            writer.writerow([_cell(value) for value in row])
-
-
-def _cell(value: Any) -> str:
-    if isinstance(value, np.bool_):
-        return "yes" if value else "no"
-    if isinstance(value, np.integer):
-        return str(value)
-    return "" if np.isnan(value) else f"{value:.9g}"
 
 
 def _write_netcdf(path: Path, posterior: FrameTimePosterior) -> None:

@@ -10,14 +10,9 @@ import numpy as np
 import typer
 
 from foldgauss._runtime.checks import invalid, require
-from foldgauss.cli.app.application import out, warn
-from foldgauss.cli.app.help import complete_choice
-from foldgauss.cli.shared.console import Video, list_frames
-from foldgauss.io.media.clip import DEINTERLACE
-from foldgauss.io.media.frame_rate import MAX_FPS, MIN_FPS
+from foldgauss.cli.app.application import warn
 from foldgauss.render import RenderOptions
 from foldgauss.video.models.frame_times import played_positions, remapped_positions, times_at
-from foldgauss.video.motion.slow_motion import even_durations
 
 #: Largest number of times, which at usual rates play for an hour.
 MAX_TIMES = 100_000
@@ -34,35 +29,12 @@ NewClip = Annotated[
 Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace existing outputs.")]
 Size = Annotated[str | None, typer.Option(metavar="HxW", help="Height x width in pixels, such as 160x320.")]
 Frames = Annotated[str | None, typer.Option(metavar="A:B", help="Frames A to B, without B; either may be omitted.")]
-Levels = Annotated[
-    int | None,
-    typer.Option(
-        metavar="N",
-        help="Value of white in a clip of 16 bits, such as 4095 for data of 12 [default: 65535].",
-        hidden=True,
-    ),
-]
-Deinterlace = Annotated[
-    str,
-    typer.Option(
-        metavar="HOW",
-        help="Interlaced frames: frames, each becomes one; fields, two at twice the rate; refuse.",
-        hidden=True,
-        autocompletion=complete_choice(DEINTERLACE),
-    ),
-]
 FittedFrames = Annotated[
     str | None,
     typer.Option(
         metavar="A:B",
         help="Frames A up to, not including, B of the clip, as many as the model has "
         "[default: those that it was fitted to].",
-    ),
-]
-Times = Annotated[
-    str | None,
-    typer.Option(
-        metavar="T,T,..|A:B:N", help="Times in [0, 1], or N times from A to B [default: those of the frames]."
     ),
 ]
 AlphaCutoff = Annotated[
@@ -172,23 +144,6 @@ MIN_SPEED = 1e-4
 MAX_SECONDS = 1e6
 MAX_EVEN_FPS = 50.0  # frames per second, the most of a GIF: a constant rate is not made higher for short intervals
 
-Fps = Annotated[
-    float | None,
-    typer.Option(
-        metavar="RATE",
-        help="Frames per second [default: as the clip].",
-        min=MIN_FPS,
-        max=MAX_FPS,
-    ),
-]
-Speed = Annotated[float | None, typer.Option(help="Playback speed: 0.25 is slow motion, -1 backwards.")]
-
-
-SkipRepeats = Annotated[
-    bool,
-    typer.Option("--skip-repeats", help="Shorten intervals in which frames repeat, which stutter when slow."),
-]
-
 
 @dataclasses.dataclass(frozen=True)
 class Timeline:
@@ -259,20 +214,6 @@ class Timeline:
         if seconds is not None:
             return times_at(frame_times, _place(_seconds_played(seconds, fps * rate, speed), seconds))
         return times_at(frame_times, played_positions(len(frame_times), rate, speed=speed))
-
-    def without_repeats(
-        self, video: Video, seconds: np.ndarray | None, sound: Path | None
-    ) -> tuple["Timeline", np.ndarray]:
-        """The timeline at a constant rate, and the clip's seconds with less between a frame and its repetition."""
-        others = {"--times": self.chosen, "--frame": self.frame, "--remap": self.remap, "--sound": sound}
-        refuse_together("--skip-repeats", others)
-        durations, fps = even_durations(video), video.fps
-        repeats = np.flatnonzero(durations < 1) + 1
-        out.print(f"Frames that repeat the one before: {list_frames(repeats) or 'none'}.", soft_wrap=True)
-        shown = np.full(video.num_frames, 1 / fps) if seconds is None else np.diff(seconds)
-        shown[:-1] *= durations
-        timeline = dataclasses.replace(self, fps=self.rate(fps, seconds))
-        return timeline, np.append(0.0, np.cumsum(shown))
 
     def warn_of_end(self, num_frames: int, fps: float, seconds: np.ndarray | None) -> None:
         """Warn if `remap` exceeds the clip."""

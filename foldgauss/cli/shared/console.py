@@ -16,7 +16,7 @@ from jaxtyping import Float
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.table import Table
 
-from foldgauss._runtime.checks import ParameterError
+from foldgauss._runtime.checks import require
 from foldgauss.cli.app.application import err, out, warn
 from foldgauss.io._atomic import atomic_path
 from foldgauss.video.editing.edited_video import EditedVideo
@@ -81,8 +81,9 @@ LINE_SECONDS = 30.0
 
 def choose_display(quiet: bool = False, log_json: bool = False) -> Display:
     """How progress is displayed: as the options say, otherwise a bar on a terminal and lines in a log."""
-    if quiet and log_json:
-        raise ParameterError("--quiet", "expected one of --quiet and --log-json, got both. Leave one out.")
+    require(
+        not (quiet and log_json), "--quiet", expected="one of --quiet and --log-json", got="both", cure="Leave one out."
+    )
     if quiet or log_json:
         return "quiet" if quiet else "json"
     return "bar" if err.is_terminal else "lines"

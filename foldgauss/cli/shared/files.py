@@ -1,9 +1,9 @@
 """Inputs and outputs of commands: checks before any work is done, and models with the clips they were fitted to."""
 
+import dataclasses
 import os
 from collections.abc import Callable, Collection, Mapping
 from pathlib import Path
-from typing import Any
 
 from foldgauss._runtime.checks import ParameterError, invalid, require
 from foldgauss.cli.app.application import warn
@@ -12,7 +12,7 @@ from foldgauss.cli.shared.console import Video, show_status
 from foldgauss.io._atomic import check_replaceable, check_writable, resolve
 from foldgauss.io.media.clip import Clip
 from foldgauss.io.media.images import IMAGE_SUFFIXES
-from foldgauss.io.media.indexing import LazyFrames, index_video
+from foldgauss.io.media.indexing import index_video, read_indexed
 from foldgauss.io.media.reading import memory_limit, read_video
 from foldgauss.io.media.writing import ANIMATION_SUFFIXES, FRAME_NAMES, VIDEO_SUFFIXES
 from foldgauss.io.models.segmented import is_segmented
@@ -167,27 +167,27 @@ def read_fitted_clip(
     For a model in segments the frames are `LazyFrames`, since the clip may be larger than memory. `name` is the
     argument or the option that gives the clip. Commands with such an option have no --frames.
 
-    Raises ParameterError, with `same_number`, for another number of frames than the model's, and for a clip to which
-    the recorded range or options of reading do not apply.
+    Raises ParameterError, with `same_number`, for another number of frames than the model's, and for a clip that
+    has fewer frames than the recorded range.
     """
     about = read_origin(model_path)
-    kept, reading = about.get("frames"), about.get("reading", {})
+    kept = about.get("frames")
     wanted = parse_frames(frames) if frames is not None else (tuple(kept) if kept else None)
     try:
-        read = _read_lazily if isinstance(model, SegmentedVideo) else read_video
-        clip = read(video, frames=wanted, size=model.size, **reading)
-    except ParameterError as error:
-        if error.parameter == "frames" and frames is None:
-            as_fitted, got = f"frames {wanted[0]}:{wanted[1]} of {about.get('clip')}", "which has fewer"
-        elif error.parameter in reading:
-            as_fitted = f"{about.get('clip')} read with {error.parameter}={reading[error.parameter]!r}"
-            got = "to which that does not apply"
+        if isinstance(model, SegmentedVideo):
+            with show_status(f"Indexing {video.name}"):
+                index = index_video(video, frames=wanted, find_cuts=False)
+            clip = dataclasses.replace(read_indexed(index, 0, size=model.size, lazy=True), notes=index.notes)
         else:
+            clip = read_video(video, frames=wanted, size=model.size)
+    except ParameterError as error:
+        if error.parameter != "frames" or frames is not None:
             raise
+        as_fitted = f"frames {wanted[0]}:{wanted[1]} of {about.get('clip')}"
         raise invalid(
             name,
             expected=f"the clip that the model was fitted to, {as_fitted}",
-            got=f"{str(video)!r}, {got}",
+            got=f"{str(video)!r}, which has fewer",
             cure="Give that clip.",
         ) from error
     for note in clip.notes:
@@ -208,17 +208,6 @@ def read_fitted_clip(
             "another clip or range, or another decoder read them."
         )
     return clip
-
-
-def _read_lazily(
-    video: Path, *, frames: tuple[int | None, int | None] | None, size: tuple[int, int], **reading: Any
-) -> Clip:
-    """As `read_video`, with only some frames in memory."""
-    with show_status(f"Indexing {video.name}"):
-        index = index_video(video, frames=frames, find_cuts=False, **reading)
-    lazy = LazyFrames(index, size)
-    about = index.source, index.num_declared, index.times, index.notes, index.first_second, index.duration
-    return Clip(lazy, index.fps, *about, index.reading)
 
 
 def is_other_clip(model_path: Path, clip: Clip, measure_psnr: Callable[[], float]) -> bool:

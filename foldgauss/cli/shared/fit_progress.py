@@ -3,8 +3,9 @@
 import json
 import time
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -38,8 +39,7 @@ def display_progress(
         observers = [] if history is None else [_stop_on_error(stack.enter_context(history), "history")]
         observers += [] if preview is None else [_stop_on_error(preview, "preview")]
         if display == "json":
-            print_line = _at_intervals(JSON_SECONDS, lambda state, info: print_json("progress", info_line(info)))
-            observers.append(_stop_on_error(print_line, "progress"))
+            observers.append(_at_intervals(JSON_SECONDS, lambda _, info: print_json("progress", info_line(info))))
         show = stack.enter_context(show_progress(display))
         if display == "bar":
             show(title, 0.0, 1.0, "estimating the motion, compiling")
@@ -52,9 +52,10 @@ def display_progress(
         yield observe
 
 
-def print_json(event: str, figures: dict) -> None:
-    """One line of JSON on standard output, at once."""
-    print(json.dumps({"event": event} | figures), flush=True)
+def print_json(event: str, figures: dict[str, Any]) -> None:
+    """One line of JSON on standard output, at once; where that is closed, the fit goes on."""
+    with suppress(OSError):
+        print(json.dumps({"event": event} | figures), flush=True)
 
 
 def save_previews(path: Path, clip: Clip, config: FitConfig) -> Observer:

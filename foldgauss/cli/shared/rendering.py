@@ -2,7 +2,7 @@
 
 import dataclasses
 import os
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -11,7 +11,6 @@ import typer
 
 from foldgauss._runtime.checks import ParameterError, require
 from foldgauss.cli.app.application import out
-from foldgauss.cli.app.help import complete_choice
 from foldgauss.cli.shared.arguments import Timeline
 from foldgauss.cli.shared.console import Video, format_count, progress_bar
 from foldgauss.cli.shared.files import IMAGE_SUFFIX
@@ -20,7 +19,6 @@ from foldgauss.io.media.frame_rate import MAX_FPS
 from foldgauss.io.media.indexing import LazyFrames
 from foldgauss.io.media.writing import (
     ANIMATION_SUFFIXES,
-    CODECS,
     MAX_GIF_FPS,
     VIDEO_SUFFIXES,
     Sound,
@@ -31,20 +29,6 @@ from foldgauss.io.media.writing import (
 from foldgauss.video.models.background import BLACK, Background
 from foldgauss.video.models.metrics import Evaluation, evaluate
 
-CodecName = Annotated[
-    str | None,
-    typer.Option(
-        "--codec",
-        help="h264 (default of .mp4), h265, av1, vp9 (of .webm), prores (of .mov) or ffv1 (of .mkv; lossless).",
-        autocompletion=complete_choice(tuple(CODECS)),
-    ),
-]
-Crf = Annotated[
-    int | None, typer.Option(help="Constant rate factor: smaller makes better and larger files [default: h264 16].")
-]
-PixelFormat = Annotated[
-    str | None, typer.Option(metavar="NAME", help="FFmpeg's name of the pixel format, such as yuv444p or yuv420p10le.")
-]
 SoundFile = Annotated[
     Path | None,
     typer.Option(
@@ -59,6 +43,7 @@ class Output:
     """Where images go and how they are encoded: a video, an animation, a folder, or a .png for one image.
 
     `times`: seconds at which the images are shown, and the end; None where they are evenly spaced at `fps`.
+    `encoding`: options of `write_video` for video files, such as `codec`; None where they are not given.
     """
 
     path: Path
@@ -66,10 +51,7 @@ class Output:
     overwrite: bool = False
     times: np.ndarray | None = None
     image_format: str = "png"
-    codec: str | None = None
-    crf: int | None = None
-    pixel_format: str | None = None
-    sound: Sound | None = None
+    encoding: Mapping[str, Any] = dataclasses.field(default_factory=dict)
 
     def check(self, size: tuple[int, int], num: int, background: Background = BLACK) -> None:
         """Refuse options that do not fit the kind of output, before `num` images of this size are computed."""
@@ -98,16 +80,17 @@ class Output:
         )
         if suffix in VIDEO_SUFFIXES:
             shape = (*size, 4 if background is None else 3)
+            chosen = [self.encoding.get(name) for name in ("codec", "crf", "pixel_format")]
             try:
-                choose_encoding(suffix, self.codec, self.crf, self.pixel_format, shape)
+                choose_encoding(suffix, *chosen, shape)
             except ParameterError as error:
                 if error.parameter != "frames":
                     raise
                 raise ParameterError("--out", error.problem) from error
             return
-        for name in ("codec", "crf", "pixel_format", "sound"):
+        for name, value in self.encoding.items():
             require(
-                getattr(self, name) is None,
+                value is None,
                 name,
                 expected="a video file for it",
                 got=repr(self.path.name),
@@ -120,12 +103,12 @@ class Output:
             image = next(iter(images()))
             out.print(f"{write_or_keep(self.path, lambda path: write_image(path, image))}: one image", soft_wrap=True)
             return
-        names = ("overwrite", "times", "image_format", "codec", "crf", "pixel_format", "sound")
-        options = {name: getattr(self, name) for name in names}
+        options = {"overwrite": self.overwrite, "times": self.times, "image_format": self.image_format}
 
         def write(path: Path) -> Path:
             with progress_bar("Rendering", num) as advance:
-                return write_video(path, _advance_over(images(), advance), min(self.fps, MAX_FPS), **options)
+                shown = advance_over(images(), advance)
+                return write_video(path, shown, min(self.fps, MAX_FPS), **options, **self.encoding)
 
         path = write_or_keep(self.path, write)
         rate = f"at {self.fps:g} frames per second"
@@ -139,7 +122,8 @@ class Output:
         return "" if self.path.is_dir() else self.path.suffix.lower()
 
 
-def _advance_over(items: Iterable[Any], advance: Callable[[], None]) -> Iterator[Any]:
+def advance_over(items: Iterable[Any], advance: Callable[[], None]) -> Iterator[Any]:
+    """The items; after each the progress advances."""
     for item in items:
         yield item
         advance()
@@ -169,16 +153,10 @@ def choose_sound(path: Path | None, timeline: Timeline, about: dict[str, Any], f
 def evaluate_with_progress(
     model: Video,
     frames: np.ndarray | LazyFrames,
-    on_image: Callable[[np.ndarray], None] = lambda image: None,
     *,
     shown: bool = True,
     background: tuple[float, float, float] = BLACK,
 ) -> Evaluation:
-    """Scores of every frame; `on_image` receives the rendered images."""
+    """Scores of every frame."""
     with progress_bar("Evaluating", model.num_frames, shown) as advance:
-
-        def on_frame(image: np.ndarray) -> None:
-            on_image(image)
-            advance()
-
-        return evaluate(model, frames, on_frame, background=background)
+        return evaluate(model, frames, lambda _: advance(), background=background)

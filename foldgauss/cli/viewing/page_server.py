@@ -16,11 +16,6 @@ TOKEN_HEADER = "X-Foldgauss-Token"
 SCRIPT_URL = "/script"
 
 
-def make_token() -> str:
-    """A new random token, 256 bits."""
-    return secrets.token_urlsafe(32)
-
-
 def script_path(model_path: Path) -> Path:
     """The edit script of a model, beside it: clip.edit.toml of clip.safetensors."""
     return model_path.with_name(model_path.stem + ".edit.toml")

@@ -13,12 +13,9 @@ from foldgauss.cli.app.application import command, out
 from foldgauss.cli.app.help import complete_choice
 from foldgauss.cli.shared.arguments import (
     AlphaCutoff,
-    Fps,
     ModelFile,
     Overwrite,
     Size,
-    SkipRepeats,
-    Speed,
     SupportRadius,
     Timeline,
     TransmittanceStop,
@@ -32,16 +29,16 @@ from foldgauss.cli.shared.arguments import (
 from foldgauss.cli.shared.console import Video, print_log, print_shots, progress_bar
 from foldgauss.cli.shared.files import IMAGE_SUFFIX, check_images_output, name_after, refuse_huge
 from foldgauss.cli.shared.rendering import (
-    CodecName,
-    Crf,
     Output,
-    PixelFormat,
     SoundFile,
+    advance_over,
     choose_sound,
 )
 from foldgauss.io._atomic import resolve
+from foldgauss.io.media.frame_rate import MAX_FPS, MIN_FPS
 from foldgauss.io.media.masks import read_masks
-from foldgauss.io.media.writing import IMAGE_FORMATS, VIDEO_SUFFIXES
+from foldgauss.io.media.reading import stack_frames
+from foldgauss.io.media.writing import CODECS, IMAGE_FORMATS, VIDEO_SUFFIXES
 from foldgauss.io.models.video_model import load_video_model, read_frame_seconds, read_origin
 from foldgauss.video.models.background import Background
 from foldgauss.video.motion.background_plate import Alignment, Frames, Masks, fill_background
@@ -70,9 +67,11 @@ def render(
         ),
     ] = None,
     size: Size = None,
-    fps: Fps = None,
-    speed: Speed = None,
-    skip_repeats: SkipRepeats = False,
+    fps: Annotated[
+        float | None,
+        typer.Option(metavar="RATE", help="Frames per second [default: as the clip].", min=MIN_FPS, max=MAX_FPS),
+    ] = None,
+    speed: Annotated[float | None, typer.Option(help="Playback speed: 0.25 is slow motion, -1 backwards.")] = None,
     remap: Annotated[
         str | None,
         typer.Option(metavar="S=C,S=C,..", help="Second C of the clip at second S: 0=0,1=1,3=1,4=2 holds second 1."),
@@ -157,9 +156,20 @@ def render(
             autocompletion=complete_choice(IMAGE_FORMATS),
         ),
     ] = None,
-    codec: CodecName = None,
-    crf: Crf = None,
-    pixel_format: PixelFormat = None,
+    codec: Annotated[
+        str | None,
+        typer.Option(
+            help="h264 (default of .mp4), h265, av1, vp9 (of .webm), prores (of .mov) or ffv1 (of .mkv; lossless).",
+            autocompletion=complete_choice(tuple(CODECS)),
+        ),
+    ] = None,
+    crf: Annotated[
+        int | None, typer.Option(help="Constant rate factor: smaller makes better and larger files [default: h264 16].")
+    ] = None,
+    pixel_format: Annotated[
+        str | None,
+        typer.Option(metavar="NAME", help="FFmpeg's name of the pixel format, such as yuv444p or yuv420p10le."),
+    ] = None,
     sound: SoundFile = None,
     alpha_cutoff: AlphaCutoff = None,
     support_radius: SupportRadius = None,
@@ -174,13 +184,12 @@ def render(
     needed = {"--smoothing": smoothing, "--border": border} if camera is None else {}
     needed |= {} if plate else {"--masks": masks_path, "--save-masks": save_masks}
     for option, value in needed.items():
-        if value is not None:
-            other = "--plate" if "masks" in option else "--stabilize"
-            raise invalid(option, expected=f"{other} too", got=f"{option} alone")
+        other = "--plate" if "masks" in option else "--stabilize"
+        require(value is None, option, expected=f"{other} too", got=f"{option} alone")
     if camera == "fixed":
         refuse_together("--stabilize fixed", {"--smoothing": smoothing})
     if plate:
-        others = {"--stabilize": camera, "--fps": fps, "--skip-repeats": skip_repeats}
+        others = {"--stabilize": camera, "--fps": fps}
         refuse_together("--plate", others | timeline.ways | {"--background none": background_color is None})
     kind = ".plate" if plate else "" if camera is None else ".stable"
     out_path = _name_output(model_path, timeline, image_format, kind) if out_path is None else out_path
@@ -195,13 +204,11 @@ def render(
     refuse_huge(image_size)
     seconds, sounding = read_frame_seconds(about, model.num_frames), choose_sound(sound, timeline, about, model.fps)
     rate = timeline.rate(model.fps, seconds)
-    if skip_repeats:
-        timeline, seconds = timeline.without_repeats(model, seconds, sound)
     shown = timeline.times(np.asarray(model.frame_times.times()), model.fps, seconds)
     timeline.warn_of_end(model.num_frames, model.fps, seconds)
     stamps = timeline.stamps(seconds)
     encoding = {"codec": codec, "crf": crf, "pixel_format": pixel_format, "sound": sounding}
-    output = Output(out_path, rate, overwrite, stamps, image_format or "png", **encoding)
+    output = Output(out_path, rate, overwrite, stamps, image_format or "png", encoding)
     output.check(image_size, len(shown), background_color)
     if plate:
         _make_plate(model, about, output, image_size, background_color, masks_path, save_masks, inputs)
@@ -263,11 +270,8 @@ def _make_plate(
         cure="Fit more frames: a plate is what other frames show behind the object.",
     )
     masks = None if masks_path is None else _read_masks(masks_path, model, size, about)
-    frames = np.empty((model.num_frames, *size, 3), np.uint8)
     with progress_bar("Rendering", model.num_frames) as advance:
-        for k, frame in enumerate(model.frames(size=size, background=background)):
-            frames[k] = frame
-            advance()
+        frames = stack_frames(advance_over(model.frames(size=size, background=background), advance))
     out.print("Searching for what moves against the background ..." if masks is None else "Aligning frames ...")
     alignment = Alignment.from_frames(frames)
     print_shots(alignment.starts, np.asarray(model.frame_times.times()))
@@ -282,7 +286,7 @@ def _make_plate(
 
 def _read_masks(path: Path, model: Video, size: tuple[int, int], about: dict[str, Any]) -> Masks:
     """The user's masks, one for each frame of the model, at the size of the images."""
-    masks = read_masks(path, size=model.size, stretched=about.get("stretched"))
+    masks = read_masks(path, size=model.size)
     masks = masks.reshape(-1, *masks.shape[-2:])  # one image is for all frames
     first, num = (about.get("frames") or (0,))[0] or 0, model.num_frames
     if len(masks) >= first + num:

@@ -1,5 +1,6 @@
 """The command `view`."""
 
+import secrets
 import webbrowser
 from functools import partial
 from pathlib import Path
@@ -12,7 +13,7 @@ from foldgauss.cli.app.application import command, err, out
 from foldgauss.cli.shared.arguments import Overwrite, refuse_together
 from foldgauss.cli.shared.console import show_status
 from foldgauss.cli.shared.files import check_output, read_fitted_clip, refuse_existing
-from foldgauss.cli.viewing.page_server import PageServer, make_token, script_path
+from foldgauss.cli.viewing.page_server import PageServer, script_path
 from foldgauss.io._atomic import atomic_path, write_or_keep
 from foldgauss.io.media.clip import Clip
 from foldgauss.io.models.video_model import load_video_model
@@ -101,7 +102,7 @@ def _read_original(model_path: Path, original: Path | None) -> Clip | None:
 
 
 def _serve(model_path: Path, original: Clip | None, quality: int, moving: bool, port: int, browser: bool) -> None:
-    script, token = script_path(model_path), make_token()
+    script, token = script_path(model_path), secrets.token_urlsafe(32)
     target = SaveTarget(script.name, token)
     make_page = partial(html_page, model_path, original=original, quality=quality, save_to=target)
     with show_status("Searching for what moves, writing the page" if moving else "Writing the page"):
@@ -110,7 +111,7 @@ def _serve(model_path: Path, original: Clip | None, quality: int, moving: bool, 
         except NothingMoves as error:
             err.print(f"The page has no button for the moving object: {error}", soft_wrap=True)
             page = make_page()
-    warn_of_size(page, original is not None)
+    warn_of_size(page)
     try:
         server = PageServer(page.encode(), port, script=script, token=token)
     except OSError as error:

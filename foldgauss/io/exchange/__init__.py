@@ -1,5 +1,5 @@
 """Formats of other programs.
 
-`export.export` chooses the format by its name; `vegas_ply` reads and writes videos of the
-published VeGaS code, `gaussians_ply` static 3DGS scenes, and `pseudomesh` frames as triangles for mesh tools.
+`vegas_ply` reads and writes videos of the published VeGaS code, `gaussians_ply` static 3DGS scenes, and `pseudomesh`
+frames as triangles for mesh tools.
 """

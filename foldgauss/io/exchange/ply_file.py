@@ -6,6 +6,7 @@ content raises only `FormatError`.
 Source of the layout: G. Turk, "The PLY Polygon File Format" (1994).
 """
 
+import json
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -38,6 +39,23 @@ class FormatError(ParameterError):
 def format_error(path: object, *, expected: str, got: str, cure: str = "") -> FormatError:
     """The error for a file; `path` is its name, optionally with the position in it."""
     return invalid(str(path), expected=expected, got=got, cure=cure, kind=FormatError)
+
+
+def parse_notes(path: object, text: str) -> dict:
+    """Metadata that foldgauss wrote as JSON. Raises `FormatError` for another text."""
+    try:
+        notes = json.loads(text)
+    except (ValueError, RecursionError):
+        notes = None
+    require(
+        isinstance(notes, dict),
+        str(path),
+        expected="metadata as foldgauss writes them",
+        got=repr(text[:60]),
+        cure="Remove them, and give the size.",
+        kind=FormatError,
+    )
+    return notes
 
 
 def facts_error(path: object, error: Exception) -> FormatError:
@@ -135,13 +153,14 @@ def read_ply(path: PathLike, wanted: Iterable[str]) -> Ply:
         if wanted <= found.keys():
             break
         lists = [column for column, code in columns.items() if code == _LIST]
-        if lists:
-            raise format_error(
-                path,
-                expected=f"plain numbers only in element {name!r}",
-                got=f"the list {lists[0]!r}",
-                cure="It is a mesh, or made by another program.",
-            )
+        require(
+            not lists,
+            str(path),
+            expected=f"plain numbers only in element {name!r}",
+            got=f"the list {', '.join(map(repr, lists))}",
+            cure="It is a mesh, or made by another program.",
+            kind=FormatError,
+        )
         row = np.dtype([(column, order + code if order else "f8") for column, code in columns.items()])
         first, at = at, at + count * (row.itemsize if order else len(columns))
         require(
@@ -187,13 +206,14 @@ def _split_header(path: Path, data: bytes) -> tuple[list[str], int]:
         kind=FormatError,
     )
     found = _END_OF_HEADER.search(data[:MAX_HEADER])
-    if found is None:
-        raise format_error(
-            path,
-            expected="a line 'end_header'",
-            got=f"none in {min(len(data), MAX_HEADER)} bytes",
-            cure="Copy the file again.",
-        )
+    require(
+        found,
+        str(path),
+        expected="a line 'end_header'",
+        got=f"none in {min(len(data), MAX_HEADER)} bytes",
+        cure="Copy the file again.",
+        kind=FormatError,
+    )
     return data[: found.start()].decode("ascii", errors="replace").split("\n")[1:-1], found.end()
 
 
@@ -229,9 +249,15 @@ def _parse_header(path: Path, lines: list[str]) -> tuple[str, dict[str, tuple[in
         cure="Copy it again.",
         kind=FormatError,
     )
-    empty = [name for name, (_, columns) in elements.items() if not columns]
-    if empty:
-        raise format_error(path, expected=f"properties of element {empty[0]!r}", got="none", cure="Copy it again.")
+    empty = ", ".join(name for name, (_, columns) in elements.items() if not columns)
+    require(
+        not empty,
+        str(path),
+        expected=f"properties of element {empty!r}",
+        got="none",
+        cure="Copy it again.",
+        kind=FormatError,
+    )
     return order, elements, tuple(comments)
 
 

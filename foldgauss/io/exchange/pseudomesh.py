@@ -17,12 +17,12 @@ from jaxtyping import Float, UInt8
 from foldgauss._runtime.checks import check_one_of, check_within, require
 from foldgauss.io._atomic import PathLike, atomic_folder, missing_error
 from foldgauss.io.exchange.gaussians_ply import check_times, frame_gaussians, read_3dgs_ply, write_gaussians_ply
-from foldgauss.io.exchange.ply_file import FormatError, facts_error, format_error, read_bytes
+from foldgauss.io.exchange.ply_file import FormatError, facts_error, format_error, parse_notes, read_bytes
 from foldgauss.io.media.clip import Size
 from foldgauss.io.media.frame_rate import DEFAULT_FPS
 from foldgauss.io.media.images import natural_sort_key
 from foldgauss.render import COMPOSITINGS, Camera, Gaussians3D, RenderOptions, Splats2D, Triangles, cpu, project
-from foldgauss.render.splats import check_size, pixels_per_unit
+from foldgauss.render.splats import check_size
 from foldgauss.render.triangle import COLLINEAR
 from foldgauss.video.models.background import BLACK, check_background
 from foldgauss.video.models.renderer import RenderedVideo, VideoRenderer, to_bytes
@@ -69,43 +69,24 @@ class Pseudomesh:
     def splats(self, number: int, size: Size | None = None) -> Splats2D:
         """The conditioned Gaussians of a frame, in pixels of an image of `size` (default: the video's own).
 
-        Frames whose vertices lie in the plane are rendered directly, others through the front camera, in array order.
-        Source: VeGaS eq:gaussrecons1, eq:gaussrecons2.
+        They are those that the front camera sees, in array order. Source: VeGaS eq:gaussrecons1, eq:gaussrecons2.
         """
         size = self.size if size is None else size
         check_size(size)
-        faces, aspect = self.triangles[number], self.size[0] / self.size[1]
-        if faces.origin[:, 2].any() or faces.edges[..., 2].any():
-            return jax.tree.map(np.asarray, project(faces.to_gaussians(), Camera.front(aspect), size, order="array"))
-        unit = pixels_per_unit(size, aspect=aspect)
-        center = np.array([size[1] / 2, size[0] / 2], np.float32)
-        mean, factor = faces.origin[:, :2] * np.float32(unit) + center, _flat_factor(faces.edges) * np.float32(unit)
-        return Splats2D(mean, factor, faces.opacity, faces.color)
-
-    def frame(
-        self, number: int, size: Size | None = None, *, background: tuple[float, float, float] = BLACK
-    ) -> UInt8[np.ndarray, "height width 3"]:
-        """The image of a frame over `background`. Raises ValueError for an invalid size or background."""
-        size = self.size if size is None else tuple(size)
-        splats, behind = self.splats(number, size), check_background(background, self.compositing)
-        leaves = (splats.mean, splats.factor, splats.opacity, splats.color)
-        drawn = {"compositing": self.compositing, "options": self.options}
-        return to_bytes(cpu.forward(*leaves, behind, size, **drawn).image)
+        camera = Camera.front(self.size[0] / self.size[1])
+        return jax.tree.map(np.asarray, project(self.triangles[number].to_gaussians(), camera, size, order="array"))
 
     def frames(
         self, size: Size | None = None, *, background: tuple[float, float, float] = BLACK
     ) -> Iterator[UInt8[np.ndarray, "height width 3"]]:
-        """The images of all frames one by one."""
+        """The images of all frames one by one. Raises ValueError for an invalid size or background."""
+        size = self.size if size is None else tuple(size)
+        behind = check_background(background, self.compositing)
         for number in range(self.num_frames):
-            yield self.frame(number, size, background=background)
-
-
-def _flat_factor(edges: Float[np.ndarray, "num 2 3"]) -> Float[np.ndarray, "num 2 2"]:
-    """F = [s1 r1, s2 r2] of faces in the plane: the second edge less its part along the first (eq:gaussrecons1)."""
-    first, second = edges[:, 0, :2], edges[:, 1, :2]
-    along = first / np.linalg.norm(first, axis=-1, keepdims=True)
-    second = second - along * np.sum(along * second, axis=-1, keepdims=True)
-    return np.stack([first, second], axis=-1)
+            splats = self.splats(number, size)
+            leaves = (splats.mean, splats.factor, splats.opacity, splats.color)
+            drawn = cpu.forward(*leaves, behind, size, compositing=self.compositing, options=self.options)
+            yield to_bytes(drawn.image)
 
 
 # ---------------------------------------------------------------------------------------------- writing
@@ -181,15 +162,13 @@ def _axes(factor: Float[np.ndarray, "num 2 2"]) -> Float[np.ndarray, "num 2 2"]:
 # ---------------------------------------------------------------------------------------------- reading
 
 
-def read_pseudomesh(
-    folder: PathLike, *, size: Size | None = None, fps: float | None = None, axes: str = "y-up"
-) -> Pseudomesh:
+def read_pseudomesh(folder: PathLike, *, size: Size | None = None, fps: float | None = None) -> Pseudomesh:
     """Read frames as triangles, after editing in a mesh tool or straight from `write_pseudomesh`.
 
     Every `NAME.obj` of the folder, in natural order, with `NAME.ply` beside it: shape from the one, opacity and color
     from the other, face k being Gaussian k. `size` = (height, width), `fps` and the times come from pseudomesh.json;
-    without that file `size` must be given, the rate is 25 and the frames are evenly spaced. `axes` are those of the
-    `.obj`: "y-up" as written, or "y-down" for a tool that turned it.
+    without that file `size` must be given, the rate is 25 and the frames are evenly spaced. The axes of the `.obj` are
+    those of `write_pseudomesh`.
 
     **Raises:** `FileNotFoundError`; `FormatError`, with the file and where it can the line, for a file that is damaged
     or incomplete, faces that are no triangles or have no area, and vertices that a tool merged, split or reordered.
@@ -198,7 +177,6 @@ def read_pseudomesh(
 
     **Source:** VeGaS eq:gaussrecons1, eq:gaussrecons2; GaMeS.
     """
-    check_one_of("axes", axes, ("y-up", "y-down"))
     folder = Path(folder)
     if not os.path.exists(folder):
         raise missing_error(folder, "a folder")
@@ -212,33 +190,16 @@ def read_pseudomesh(
         kind=FormatError,
     )
     given = {name: value for name, value in (("size", size), ("fps", fps)) if value is not None}
-    facts = _check_notes(folder, _read_notes(folder, len(paths)) | given, len(paths))
-    return Pseudomesh(tuple(_read_frame(path, axes) for path in paths), **facts)
+    facts = _read_facts(folder, len(paths), given)
+    return Pseudomesh(tuple(_read_frame(path) for path in paths), **facts)
 
 
-def _read_notes(folder: Path, num_frames: int) -> dict:
-    """The content of pseudomesh.json, with defaults for folders of other programs."""
-    evenly = np.linspace(0, 1, num_frames).tolist()
+def _read_facts(folder: Path, num_frames: int, given: dict) -> dict:
+    """Size, rate, times and options: as given, else as in pseudomesh.json, else defaults."""
+    evenly, path = np.linspace(0, 1, num_frames).tolist(), folder / NOTES
     defaults = {"times": evenly, "size": None, "fps": DEFAULT_FPS, "options": {}, "compositing": "over"}
-    path = folder / NOTES
-    try:
-        found = json.loads(path.read_text(encoding="utf-8"))
-    except FileNotFoundError:
-        return defaults
-    except (ValueError, RecursionError, OSError) as error:
-        raise format_error(path, expected="JSON", got="other text", cure="Remove it, and give size.") from error
-    require(
-        isinstance(found, dict),
-        str(path),
-        expected="an object",
-        got=type(found).__name__,
-        cure="Remove it, and give size.",
-        kind=FormatError,
-    )
-    return defaults | {name: value for name, value in found.items() if name in defaults}
-
-
-def _check_notes(folder: Path, notes: dict, num_frames: int) -> dict:
+    found = parse_notes(path, read_bytes(path).decode(errors="replace")) if path.exists() else {}
+    notes = defaults | {name: value for name, value in found.items() if name in defaults} | given
     require(
         notes["size"] is not None,
         str(folder),
@@ -265,7 +226,7 @@ def _check_notes(folder: Path, notes: dict, num_frames: int) -> dict:
     return notes | {"times": times, "size": (int(size[0]), int(size[1])), "fps": fps, "options": options}
 
 
-def _read_frame(path: Path, axes: str) -> Triangles:
+def _read_frame(path: Path) -> Triangles:
     beside = path.with_suffix(".ply")
     require(
         beside.exists(),
@@ -283,8 +244,7 @@ def _read_frame(path: Path, axes: str) -> Triangles:
         cure="Faces were added or removed: keep them all, and hide Gaussians by opacity instead.",
         kind=FormatError,
     )
-    if axes == "y-up":
-        vertices = vertices * _AXES_TURN
+    vertices = vertices * _AXES_TURN
     edges = vertices[:, 1:] - vertices[:, :1]
     _check_area(path, edges)
     origin = vertices[:, 0].astype(np.float32) + np.float32(0)  # no -0
@@ -345,30 +305,33 @@ def _parse_vertex(path: Path, number: int, words: list[str]) -> tuple[float, ...
         place = tuple(float(word) for word in words[:3])
     except ValueError:
         place = ()
-    if len(place) < 3 or not all(abs(x) <= _LARGEST for x in place):
-        raise format_error(
-            f"{path}, line {number}",
-            expected="a vertex x y z",
-            got=repr(" ".join(words)[:60]),
-            cure="The file is damaged, or the tool wrote NaN.",
-        )
+    require(
+        len(place) == 3 and all(abs(x) <= _LARGEST for x in place),
+        f"{path}, line {number}",
+        expected="a vertex x y z",
+        got=repr(" ".join(words)[:60]),
+        cure="The file is damaged, or the tool wrote NaN.",
+        kind=FormatError,
+    )
     return place
 
 
 def _check_face(where: str, words: list[str], number: int) -> None:
     """Raise unless face `number`, from 1 on, has three vertices of its own, in the order in which they were written."""
-    if len(words) != 3:
-        raise format_error(
-            where,
-            expected="a face of 3 vertices",
-            got=repr(" ".join(words)[:60]),
-            cure="Only triangles represent Gaussians: disable the merging of triangles into polygons.",
-        )
+    require(
+        len(words) == 3,
+        where,
+        expected="a face of 3 vertices",
+        got=repr(" ".join(words)[:60]),
+        cure="Only triangles represent Gaussians: disable the merging of triangles into polygons.",
+        kind=FormatError,
+    )
     own = [str(3 * number + k) for k in (-2, -1, 0)]
-    if [word.split("/", 1)[0] for word in words] != own:
-        raise format_error(
-            where,
-            expected=f"face {number} of vertices {', '.join(own)}",
-            got=f"{' '.join(words)[:60]}: a tool merged, split or reordered them",
-            cure=_KEEP_ORDER,
-        )
+    require(
+        [word.split("/", 1)[0] for word in words] == own,
+        where,
+        expected=f"face {number} of vertices {', '.join(own)}",
+        got=f"{' '.join(words)[:60]}: a tool merged, split or reordered them",
+        cure=_KEEP_ORDER,
+        kind=FormatError,
+    )

@@ -12,8 +12,8 @@ from jaxtyping import Float
 
 from foldgauss._runtime.checks import check_within, invalid, require
 from foldgauss.envelope import TimeLikelihood
-from foldgauss.io._atomic import PathLike
-from foldgauss.io.exchange.ply_file import NOTE, Ply, facts_error, format_error, read_ply, write_ply
+from foldgauss.io._atomic import PathLike, atomic_folder
+from foldgauss.io.exchange.ply_file import NOTE, Ply, facts_error, parse_notes, read_ply, write_ply
 from foldgauss.io.media.clip import Size, check_fps
 from foldgauss.io.media.frame_rate import DEFAULT_FPS
 from foldgauss.render import RenderOptions
@@ -117,7 +117,11 @@ def write_vegas_ply(path: PathLike, model: VideoModel) -> Path:
     if model.splats.paths is not None:
         on_path = np.asarray(model.splats.path_index) > 0
         model, error = without_paths(model)
-        _warn_of_error(error[on_path], model.degree)
+        error = error[on_path]
+        if len(error):
+            followers = f"{len(error):,} Gaussians follow theirs by folds of degree {model.degree}"
+            rms = f"a root mean square error of {np.sqrt(np.mean(error**2)):.2g} pixels, {error.max():.2g} at most"
+            warnings.warn(f"model: the file has no shared paths: {followers}, with {rms}.", stacklevel=2)
     splats, unit = model.splats, _vegas_unit(model.size)
     plane = np.array([1.0, -1.0]) / unit
     loc = plane * np.asarray(splats.loc, np.float64)
@@ -140,14 +144,17 @@ def write_vegas_ply(path: PathLike, model: VideoModel) -> Path:
     return write_ply(path, {"vertex": columns, "time": times}, comments=[NOTE + json.dumps(note)])
 
 
-def _warn_of_error(error: Float[np.ndarray, " num"], degree: int) -> None:
-    """Say how well polynomials of this degree follow shared paths, from the distances in pixels."""
-    if len(error):
-        rms, worst = np.sqrt(np.mean(error**2)), error.max()
-        text = f"the file has no shared paths: {len(error):,} Gaussians follow theirs by folds of degree {degree}"
-        warnings.warn(
-            f"model: {text}, with a root mean square error of {rms:.2g} pixels, {worst:.2g} at most.", stacklevel=3
-        )
+def write_vegas_segments(folder: PathLike, video: SegmentedVideo, *, overwrite: bool = False) -> Path:
+    """Write each segment of a video as segment-000.ply and so on, see `write_vegas_ply`; returns the folder.
+
+    The folder appears whole or not at all. One that holds files is refused unless `overwrite`, and even then if it
+    holds anything but segments. Raises as `write_vegas_ply`; `OutputError` where the folder is refused.
+    """
+    folder = Path(folder)
+    with atomic_folder(folder, overwrite, pattern=r"segment-[0-9]{3,}\.ply", what="segments") as temporary:
+        for number, segment in enumerate(video.segments):
+            write_vegas_ply(temporary / f"segment-{number:03d}.ply", segment.model)
+    return folder
 
 
 def _convert_time_scale(
@@ -208,7 +215,8 @@ def _time_logits(ply: Ply) -> Float[np.ndarray, " intervals"]:
 
 def _fill_in(ply: Ply, size: Size | None, fps: float | None) -> tuple[Size, float, RenderOptions, float, float]:
     """Size, rate, options, cutoff and power: as given, else as recorded in the file, else the published defaults."""
-    note = _read_note(ply)
+    texts = [comment[len(NOTE) :] for comment in ply.comments if comment.startswith(NOTE)]
+    note = parse_notes(ply.path, texts[0]) if texts else {}
     ply.require(
         size is not None or "size" in note,
         expected="a size, which a VeGaS file does not hold",
@@ -230,25 +238,11 @@ def _fill_in(ply: Ply, size: Size | None, fps: float | None) -> tuple[Size, floa
     return (int(size[0]), int(size[1])), float(fps), options, float(cutoff), float(power)
 
 
-def _read_note(ply: Ply) -> dict:
-    """The metadata that `write_vegas_ply` stores in a comment; empty for files of other programs."""
-    texts = [comment[len(NOTE) :] for comment in ply.comments if comment.startswith(NOTE)]
-    try:
-        note = json.loads(texts[0]) if texts else {}
-    except (ValueError, RecursionError):
-        note = None
-    if not isinstance(note, dict) or not isinstance(note.get("options", {}), dict):
-        raise format_error(
-            ply.path, expected="metadata in the comment 'foldgauss'", got=texts[0][:60], cure="Remove it."
-        )
-    return note
-
-
 def _check_writable_as_vegas(model: VideoModel) -> None:
     if not isinstance(model, VideoModel):
         cure = "Export the frames of an edited video as ply3dgs or obj."
         if isinstance(model, SegmentedVideo):
-            cure = "export(model, 'ply', FOLDER) writes one for each segment."
+            cure = "write_vegas_segments(FOLDER, model) writes one for each segment."
         raise invalid("model", expected="a VideoModel", got=type(model).__name__, cure=cure)
     require(
         model.num_frames >= 2,

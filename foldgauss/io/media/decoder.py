@@ -18,29 +18,24 @@ from av.video.reformatter import ColorRange, Colorspace, Interpolation, VideoRef
 from foldgauss._runtime.checks import require
 from foldgauss.io._atomic import resolve
 from foldgauss.io.media.clip import (
-    AS_STORED,
     VIDEO,
     ClipFacts,
-    Levels,
-    Reading,
     Size,
     VideoError,
+    check_decoded,
     check_num_pixels,
-    clamp_stop,
     format_num_bytes,
-    no_frames_error,
     read_head,
     video_error,
 )
 from foldgauss.io.media.frame_rate import DEFAULT_FPS, MAX_FPS, MAX_LAST_DURATION, make_increasing
-from foldgauss.io.media.images import premultiply
+from foldgauss.io.media.images import premultiply, to_8_bits
 from foldgauss.io.media.tone_mapping import HDR, map_tones
 
 MAX_ERRORS = 1000  # packets in a row that cannot be read after which a video has ended
 MAX_FRAMES = 1 << 30  # a container that declares as many does not know, or is damaged
-MAX_LOST_FRAMES = 1_000_000  # a time stamp that implies a larger gap counts as damaged
 MAX_THREADS = 16
-MAX_DELAY = MAX_THREADS + 16  # frames that the decoder holds when it meets damage: one for each thread, and reordering
+MAX_DELAY = MAX_THREADS + 16  # frames that the decoder holds at the end: one for each thread, and reordering
 MAX_ASPECT = 10.0  # width by height of a pixel, or the inverse; a larger one counts as damaged
 EQUAL_ASPECT = 0.01  # by which pixels that count as square may differ: containers round
 #: Chroma is interpolated, and rounded to nearest: FFmpeg's default repeats it and rounds it down, which makes each
@@ -55,7 +50,8 @@ CONVERSION = (
 _UNSPECIFIED = 2  # FFmpeg's number of a matrix that is not declared
 #: FFmpeg's decoders of VP8 and VP9 drop alpha; these are the ones that keep it.
 _ALPHA_DECODERS = {"vp8": "libvpx", "vp9": "libvpx-vp9"}
-#: Fraction of a file after its last frame, above which it is reported; sound may follow the last frame.
+
+#: Fraction of a file after its last frame or sound that decodes, above which it is reported.
 MAX_UNREAD = 0.2
 
 #: FFmpeg's demuxers that read one file and nothing else. Playlists (hls, dash), lists (concat), stream descriptions
@@ -90,16 +86,14 @@ def round_alpha(alpha: np.ndarray, largest: int, wanted: int) -> np.ndarray:
 class VideoDecoder:
     """An open video file, which is to be closed.
 
-    `threads`: of FFmpeg's decoder, 0 for its default. How damaged frames decode depends on their number.
-    `reading`: as of `read_video`; interlaced frames are converted to progressive ones by FFmpeg's bwdif.
+    `threads`: of FFmpeg's decoder, 0 for its default. How damaged frames decode depends on their number. Interlaced
+    frames are converted to progressive ones by FFmpeg's bwdif.
 
     Raises `VideoError` for a file that does not open, or has too many pixels.
     """
 
-    def __init__(self, path: Path, threads: int = 0, reading: Reading = AS_STORED):
-        self._path, self._deinterlace, self._container = path, reading.deinterlace, open_container(path)
-        self._per_stored = 2 if self._deinterlace == "fields" else 1  # frames that each stored one becomes
-        self.levels = Levels(reading.levels)
+    def __init__(self, path: Path, threads: int = 0):
+        self._path, self._container = path, open_container(path)
         try:
             self._stream = _choose_stream(self._container, path)
             self.pixel_aspect = float(self._stream.sample_aspect_ratio or 1) or 1.0  # width by height; 1 where unknown
@@ -108,27 +102,21 @@ class VideoDecoder:
         except VideoError:
             self.close()
             raise
-        self.time_base = (self._stream.time_base or Fraction(1, 1000)) / self._per_stored
-        self._rate = (self._stream.guessed_rate or 0) * self._per_stored
-        self.fps = float(self._rate)  # that the container declares; 0 where there is none
+        self.time_base = self._stream.time_base or Fraction(1, 1000)
+        self.fps = float(self._stream.guessed_rate or 0)  # that the container declares; 0 where there is none
         self._kind = self._container.format.name
         self._num_repeated = 0  # frames that an AVI counts, but does not store: the one before is shown again
         self.has_converted = False  # whether any frame was interlaced
         self.tilt = 0  # degrees by which a frame is to be rotated beyond a multiple of 90
         self._closed = False
-        self._has_sought = False
         self.stored_size = self._codec.height, self._codec.width  # which frames of another size are stretched to
-        self._read_bytes = 0  # up to the end of the last packet that decodes
-        self._others: list[tuple[int, int]] = []  # after it, place and size of packets of other streams, such as sound
-        self._at_end = False
         #: To 8 bits and to 16: FFmpeg takes longer to prepare a conversion than to convert a small frame.
         self._converters = VideoReformatter(), VideoReformatter()
         self._angle: int | None = None  # of the display matrix
         self._matrix = 1 << 16, 0, 0, 1 << 16  # right is shown along the first two, down along the others
-        self._last = -1  # position of the frame decoded last
         self._stamp = -1  # of the frame decoded last from an AVI
-        self._before: int | None = None  # the largest time stamp
-        self._num_suspect = 0  # frames before which others may have been lost to damage
+        self.read_bytes = 0  # up to the end of the last packet that decodes, or of another stream
+        self.is_damaged = False  # whether data did not decode, or decoded with errors, since the frame before
 
     def close(self) -> None:
         """Close the file; `frames` that are being read end."""
@@ -143,16 +131,7 @@ class VideoDecoder:
     def num_declared(self) -> int:
         """The number of frames that the container counts, including those that an edit list hides; 0 where it does not
         count them. Of an AVI those that it does not store are known only once they are passed."""
-        num = self._stream.frames - self._num_repeated if 0 < self._stream.frames < MAX_FRAMES else 0
-        return num * self._per_stored
-
-    @property
-    def unread_fraction(self) -> float:
-        """The fraction of the file after the last packet that decodes, without packets of other streams, once the end
-        is reached; 0 where the container declares frames or a duration, which tell more."""
-        if not (self._at_end and self._read_bytes) or self.num_declared or self.declared_seconds is not None:
-            return 0.0
-        return 1 - (self._read_bytes + sum(size for _, size in self._others)) / self._path.stat().st_size
+        return self._stream.frames - self._num_repeated if 0 < self._stream.frames < MAX_FRAMES else 0
 
     @property
     def size(self) -> Size:
@@ -206,17 +185,18 @@ class VideoDecoder:
         if "matroska" not in self._kind:
             return 0.0
         seconds, rates = duration * self.time_base, (self._stream.average_rate, self._stream.guessed_rate)
-        is_default = any(abs(seconds - 1 / rate / self._per_stored) <= 1.5 * self.time_base for rate in rates if rate)
+        is_default = any(abs(seconds - 1 / rate) <= 1.5 * self.time_base for rate in rates if rate)
         return 0.0 if is_default else float(max(seconds, 0))
 
-    def count_declared(self, seconds: np.ndarray, fps: float, num_reached: int, last: float) -> int:
-        """The number of frames that the container declares, at least `num_reached`, of which the last is shown at
-        seconds[-1] for `last`.
+    def count_declared(self, seconds: np.ndarray, fps: float, last: float, is_damaged: bool) -> int:
+        """The number of frames that the container declares, at least those shown at `seconds`, the last for `last`.
 
         Its own count includes frames that an edit list hides, as in an MP4 that was cut without encoding; where it has
         none, the number follows from its duration.
         """
-        shown = self.declared_seconds
+        shown, num_reached = self.declared_seconds, len(seconds)
+        if is_damaged and 0 < self._stream.frames < MAX_FRAMES:  # a gap in time may be frames that are lost
+            return max(self._stream.frames, num_reached)
         if shown is None or (self.num_declared and not self._kind.startswith("mov")):
             return max(self.num_declared, num_reached)
         left, intervals, estimated = shown - (seconds[-1] - seconds[0]), np.diff(seconds), num_reached
@@ -227,27 +207,24 @@ class VideoDecoder:
         return max(min(self.num_declared or estimated, estimated), num_reached)
 
     def seek(self, stamp: int) -> None:
-        """Continue at the last key frame up to `stamp`; positions are counted from there."""
+        """Continue at the last key frame up to `stamp`."""
         with suppress(av.FFmpegError):  # a damaged index: continue where the decoder is
-            self._container.seek(stamp // self._per_stored, stream=self._stream)
+            self._container.seek(stamp, stream=self._stream)
         self._codec.flush_buffers()
-        self._has_sought = True
-        self._last, self._before, self._num_suspect = -1, None, 0
+        self.is_damaged = False
 
-    def frames(self) -> Iterator[tuple[int, int, av.VideoFrame]]:
-        """The frames that decode, in the order in which they are shown: for each its position in the file, with the
-        frames lost to damage counted, and its stamp in units of `time_base`; 0 for a stream without time stamps.
-
-        Raises `VideoError` for interlaced ones that are not to be converted.
+    def frames(self) -> Iterator[tuple[int, av.VideoFrame]]:
+        """The frames that decode, in the order in which they are shown: each with its stamp in units of `time_base`; 0
+        for a stream without time stamps. `is_damaged` tells whether it, or what is before it, is damaged.
         """
         for frame in self._convert_interlaced(self._decode()):
-            self._num_suspect = MAX_DELAY if frame.is_corrupt else self._num_suspect
-            self._last = self._find_position(frame.pts)
+            self.is_damaged |= frame.is_corrupt
             self.stored_size = self.stored_size if all(self.stored_size) else (frame.height, frame.width)
             self._find_matrix(frame)
-            yield self._last, frame.pts or 0, frame
+            yield frame.pts or 0, frame
             if self._closed:  # FFmpeg would read on in memory that is freed
                 return
+            self.is_damaged = False
 
     def _find_matrix(self, frame: av.VideoFrame) -> None:
         """Read the display matrix of the frame, where its angle is another than before: to read it keeps the frame in
@@ -257,11 +234,6 @@ class VideoDecoder:
             numbers = [1 << 16, 0, 0, 0, 1 << 16] if data is None else np.frombuffer(data, np.int32)[:5].tolist()
             self._angle, self._matrix = frame.rotation, (numbers[0], numbers[1], numbers[3], numbers[4])
             self.tilt = self.tilt or 45 - (45 - round(math.degrees(math.atan2(numbers[1], numbers[0])))) % 90
-
-    @property
-    def is_turned(self) -> bool:
-        """Whether rows of the frame decoded last are columns of the upright image."""
-        return abs(self._matrix[1]) > abs(self._matrix[0])
 
     def to_array(self, frame: av.VideoFrame) -> np.ndarray:
         """The frame decoded last, upright and uint8: BGR of shape (height, width, 3), or premultiplied BGRA of shape
@@ -273,8 +245,8 @@ class VideoDecoder:
         kind, hdr = frame.format, HDR.get(frame.color_trc)
         alpha_bits = next((min(part.bits, 16) for part in kind.components if part.is_alpha), 0)
         has_alpha = alpha_bits > 0
-        has_levels = kind.components[0].bits == 16 and (kind.is_rgb or kind.name.startswith(("gray", "ya")))
-        image = self._convert(frame, bool(hdr or has_levels), has_alpha)
+        is_deep = kind.components[0].bits == 16 and (kind.is_rgb or kind.name.startswith(("gray", "ya")))
+        image = self._convert(frame, bool(hdr or is_deep), has_alpha)
         if kind.name.startswith("gray") and frame.color_range == ColorRange.MPEG:  # FFmpeg takes it for full range
             step, bits = (256, kind.components[0].bits) if image.dtype == np.uint16 else (1, 8)
             largest = ((1 << bits) - 1) * step >> (bits - 8)
@@ -282,17 +254,17 @@ class VideoDecoder:
             image = np.rint(np.clip(expanded, 0, largest)).astype(image.dtype)
         if hdr:
             shown = map_tones(frame, image[..., :3], hdr)
-            image = np.concatenate([shown, Levels().convert(image[..., 3:])], -1) if has_alpha else shown
-        elif has_levels:
-            image = self.levels.convert(image)
-        if hdr or has_levels:
+            image = np.concatenate([shown, to_8_bits(image[..., 3:])], -1) if has_alpha else shown
+        elif is_deep:
+            image = to_8_bits(image)
+        if hdr or is_deep:
             image = cv2.cvtColor(image, cv2.COLOR_RGBA2BGRA if has_alpha else cv2.COLOR_RGB2BGR)
-        if alpha_bits > 8 and self.levels.white is None:  # to nearest, which FFmpeg's conversion to 8 bits is not
+        if alpha_bits > 8:  # to nearest, which FFmpeg's conversion to 8 bits is not
             deep = self._convert(frame, True, True)[..., 3] >> (16 - alpha_bits)
             image[..., 3] = round_alpha(deep, (1 << alpha_bits) - 1, 255)
         image = premultiply(image)
         a, b, c, d = self._matrix
-        if self.is_turned:
+        if abs(b) > abs(a):  # rows of the frame are columns of the upright image
             image, a, d = image.swapaxes(0, 1), c, b
         return np.ascontiguousarray(image[:: 1 if d >= 0 else -1, :: 1 if a >= 0 else -1])
 
@@ -322,28 +294,27 @@ class VideoDecoder:
             except av.EOFError:
                 return
             except av.FFmpegError:
-                self._num_suspect = MAX_DELAY
+                self.is_damaged = True
                 continue
-            self._at_end = packet is None
-            if not self._at_end:
-                self._read_bytes = max(self._read_bytes, (packet.pos or 0) + packet.size)
-                self._others = [other for other in self._others if other[0] > self._read_bytes]
+            self._count_bytes(packet)
             yield from map(self._set_time, found)
-            if self._at_end:
+            if packet is None:
                 return
+
+    def _count_bytes(self, packet: av.Packet | None) -> None:
+        if packet is not None:
+            self.read_bytes = max(self.read_bytes, (packet.pos or 0) + packet.size)
 
     def _read_packets(self) -> Iterator[av.Packet]:
         """The packets of the stream, of which those that cannot be read are left out."""
-        num_errors, before, place = 0, (self._stream.start_time or 0) - 1, 0
+        num_errors, before = 0, (self._stream.start_time or 0) - 1
         while num_errors < MAX_ERRORS:
             try:
                 for packet in self._container.demux():
                     if packet.stream_index != self._stream.index:
-                        place = packet.pos or place  # several packets may stand at one place
-                        self._others.append((place, packet.size))
+                        self._count_bytes(packet)
                         continue
-                    if packet.is_corrupt:
-                        self._num_suspect = MAX_DELAY
+                    self.is_damaged |= packet.is_corrupt
                     if packet.size:
                         if self._kind == "avi" and packet.dts is not None:
                             self._num_repeated += max(packet.dts - before - 1, 0)
@@ -352,40 +323,20 @@ class VideoDecoder:
                         yield packet
                 return
             except av.FFmpegError:
-                self._num_suspect, num_errors = MAX_DELAY, num_errors + 1
+                self.is_damaged, num_errors = True, num_errors + 1
 
     def _convert_interlaced(self, frames: Iterator[av.VideoFrame]) -> Iterator[av.VideoFrame]:
-        """Interlaced frames converted to progressive ones, each to one of the same time; others are passed on.
-
-        With "fields" each stored frame becomes two; a video that does not begin with an interlaced one is refused.
-        """
+        """Interlaced frames converted to progressive ones, each to one of the same time; others are passed on."""
         graph, of_graph = None, None
         for frame in frames:
-            follows = self._deinterlace == "fields" and self._has_sought  # interlaced ones before the place sought
-            if graph is None and not frame.interlaced_frame and not follows:
-                require(
-                    self._deinterlace != "fields",
-                    "deinterlace",
-                    expected="a first frame of two fields",
-                    got=f"a progressive one in {str(self._path)!r}",
-                    cure="Leave deinterlace='fields' out.",
-                    kind=VideoError,
-                )
+            if graph is None and not frame.interlaced_frame:
                 yield frame
                 continue
-            require(
-                self._deinterlace != "refuse",
-                "path",
-                expected="a video of progressive frames",
-                got=f"one of interlaced fields, {str(self._path)!r}",
-                cure="Convert it while reading, with deinterlace='frames' or 'fields'.",
-                kind=VideoError,
-            )
             kind = frame.height, frame.width, frame.format.name
             if graph is None or kind != of_graph:
                 yield from filter_frame(graph, None)
                 try:
-                    graph, of_graph = _make_deinterlacer(frame, self.time_base, self._per_stored), kind
+                    graph, of_graph = _make_deinterlacer(frame, self.time_base), kind
                 except av.FFmpegError as error:  # bwdif takes at least 3 rows and columns of each channel
                     raise video_error(
                         "path",
@@ -406,18 +357,6 @@ class VideoDecoder:
             frame.pts = None
         return frame
 
-    def _find_position(self, stamp: int | None) -> int:
-        """The position of the next frame; the number of frames lost before it to damage is estimated by time stamps."""
-        lost, frame = 0, 1 / (self._rate or Fraction(DEFAULT_FPS)) / self.time_base
-        if self._num_suspect and stamp is not None:
-            start = (self._stream.start_time or 0) * self._per_stored
-            before = self._before if self._before is not None else start - frame
-            lost = round((stamp - before) / frame) - 1
-        self._num_suspect = max(self._num_suspect - 1, 0)
-        if stamp is not None and (self._before is None or stamp > self._before):  # damage may disorder frames
-            self._before = stamp
-        return self._last + 1 + (lost if 0 < lost < MAX_LOST_FRAMES else 0)
-
     def _choose_codec(self, threads: int) -> av.VideoCodecContext:
         codec = self._stream.codec_context
         name = _ALPHA_DECODERS.get(codec.name)
@@ -430,13 +369,13 @@ class VideoDecoder:
 
 
 def scan_video(
-    path: Path, start: int, stop: int | None, keep: Callable[[Iterator[np.ndarray]], Sized], reading: Reading
+    path: Path, start: int, stop: int | None, keep: Callable[[Iterator[np.ndarray]], Sized]
 ) -> tuple[Sized, ClipFacts]:
     """What `keep` makes of the frames of a video file from `start` up to `stop`, and the facts about the file.
 
     Raises `VideoError` for a file that cannot be read.
     """
-    places, ticks, following, transfers, duration = [], [], [], set(), 0
+    ticks, following, transfers, duration = [], [], set(), 0
     damaged, resized = [], []
 
     def select() -> Iterator[np.ndarray]:
@@ -445,57 +384,54 @@ def scan_video(
         Frames before `start` are decoded and dropped: seeking stops at key frames.
         """
         nonlocal duration
-        for position, stamp, frame in decoder.frames():
-            if stop is not None and position >= stop:
-                if places and position == places[-1] + 1:
-                    following.append(stamp)
+        for number, (stamp, frame) in enumerate(decoder.frames()):
+            if number == stop:
+                following.append(stamp)
                 return
-            places.append(position)
             ticks.append(stamp)
             duration = frame.duration or 0
-            if frame.is_corrupt:
-                damaged.append(position)
+            if decoder.is_damaged:
+                damaged.append(number)
             if (frame.height, frame.width) != decoder.stored_size:
-                resized.append(position)
-            if position >= start:
+                resized.append(number)
+            if number >= start:
                 transfers.add(HDR.get(frame.color_trc))
                 yield decoder.to_array(frame)
 
-    with closing(VideoDecoder(path, reading=reading)) as decoder:
+    with closing(VideoDecoder(path)) as decoder:
         fps = decoder.fps if 0 < decoder.fps <= MAX_FPS else DEFAULT_FPS
         kept = keep(select())
         require(
-            places,
+            ticks,
             "path",
             expected="a video with frames that decode",
             got=f"none in {str(path)!r}",
             cure="The file is damaged or its codec is unknown here; convert it with ffmpeg.",
             kind=VideoError,
         )
-        time_base, num_reached = float(decoder.time_base), places[-1] + 1
+        time_base = float(decoder.time_base)
         seconds = make_increasing((np.array(ticks + following) * time_base).tolist(), fps)
         seconds, end = seconds[: len(ticks)], float(seconds[-1])
         if not following:
-            last = decoder.find_last_duration(duration, seconds[-1] - seconds[0], num_reached)
+            last = decoder.find_last_duration(duration, seconds[-1] - seconds[0], len(ticks))
             end = float(seconds[-1] + last) if last else 0.0
-        num_total = decoder.count_declared(seconds, fps, num_reached, max(end - seconds[-1], 0.0))
-        notes = _describe_video(decoder, path, sorted(transfers - {None}), reading) if len(kept) else []
-        order = -1 if decoder.is_turned else 1
-        stretched = decoder.stored_size[::order], decoder.size[::order]
+        num_total = decoder.count_declared(seconds, fps, max(end - seconds[-1], 0.0), is_damaged=bool(damaged))
+        notes = _describe_video(decoder, sorted(transfers - {None})) if len(kept) else []
+        is_whole = not following and not decoder.num_declared and decoder.declared_seconds is None
+        unread = 1 - decoder.read_bytes / path.stat().st_size
+        if is_whole and decoder.read_bytes and unread > MAX_UNREAD:
+            notes.append(f"the last {unread:.0%} of the file hold no frame that decodes.")
     # The container's count may be an estimate, so the range is checked against the decoded frames as well.
-    clamp_stop(start, stop, num_total, path)
-    if not len(kept):
-        raise no_frames_error(start, stop, len(places), num_total, path)
+    check_decoded(len(kept), start, stop, len(ticks), num_total, path)
     return kept, ClipFacts(
-        *("video", fps, num_total, np.array(places, np.int64), np.array(ticks, np.int64), time_base, end, notes),
+        *("video", fps, num_total, np.array(ticks, np.int64), time_base, end, notes),
         threads=decoder.threads,
         damaged=damaged,
         resized=resized,
-        stretched=stretched if stretched[0] != stretched[1] else None,
     )
 
 
-def _describe_video(decoder: VideoDecoder, path: Path, hdr: list[str], reading: Reading) -> list[str]:
+def _describe_video(decoder: VideoDecoder, hdr: list[str]) -> list[str]:
     """Notes about a video that was read, whose frames in HDR have these transfer functions."""
     notes = []
     if abs(decoder.pixel_aspect - 1) > EQUAL_ASPECT:
@@ -508,14 +444,8 @@ def _describe_video(decoder: VideoDecoder, path: Path, hdr: list[str], reading: 
         turn = f"{decoder.tilt} degrees beyond multiples of 90"
         notes.append(f"the file asks for a rotation by {turn}; it is left out.")
     if decoder.has_converted:
-        each = "one of each; foldgauss fit --deinterlace fields makes two"
-        each = "one of each field" if reading.deinterlace == "fields" else each
-        notes.append(f"interlaced frames are converted to progressive ones, {each}.")
-    if (unread := decoder.unread_fraction) > MAX_UNREAD:
-        notes.append(f"the last {unread:.0%} of the file hold no frame that decodes.")
-    return notes + list(
-        decoder.levels.describe(path, "HDR, whose tone mapping defines white" if hdr else "a clip of fewer bits")
-    )
+        notes.append("interlaced frames are converted to progressive ones.")
+    return notes
 
 
 def open_container(path: Path, demuxers: str = DEMUXERS) -> av.container.InputContainer:
@@ -545,9 +475,14 @@ def open_container(path: Path, demuxers: str = DEMUXERS) -> av.container.InputCo
 
 def _choose_stream(container: av.container.InputContainer, path: Path) -> av.VideoStream:
     stream = container.streams.best("video")
-    if stream is None:
-        kind = "audio" if container.streams.audio else "no video stream"
-        raise video_error("path", expected=VIDEO, got=f"{str(path)!r} ({kind}), which does not open as a video")
+    kind = "audio" if container.streams.audio else "no video stream"
+    require(
+        stream is not None,
+        "path",
+        expected=VIDEO,
+        got=f"{str(path)!r} ({kind}), which does not open as a video",
+        kind=VideoError,
+    )
     require(
         stream.codec_context is not None,
         "path",
@@ -567,12 +502,12 @@ def _choose_stream(container: av.container.InputContainer, path: Path) -> av.Vid
     return stream
 
 
-def _make_deinterlacer(frame: av.VideoFrame, clock: Fraction, num: int) -> Graph:
-    """A filter that makes `num` frames, 1 or 2, of each: of two fields, or one of each field. `clock`: theirs."""
+def _make_deinterlacer(frame: av.VideoFrame, clock: Fraction) -> Graph:
+    """A filter that makes a progressive frame of each interlaced one, with time stamps in units of `clock`."""
     graph = Graph()
-    source = graph.add_buffer(width=frame.width, height=frame.height, format=frame.format, time_base=clock * num)
-    filtered = graph.add("bwdif", "mode=send_field:deint=all" if num == 2 else "mode=send_frame:deint=interlaced")
-    same_clock = graph.add("settb", f"{clock.numerator}/{clock.denominator}")  # bwdif's would be twice as fast
+    source = graph.add_buffer(width=frame.width, height=frame.height, format=frame.format, time_base=clock)
+    filtered = graph.add("bwdif", "mode=send_frame:deint=interlaced")
+    same_clock = graph.add("settb", f"{clock.numerator}/{clock.denominator}")  # bwdif's is twice as fast
     graph.link_nodes(source, filtered, same_clock, graph.add("buffersink")).configure()
     return graph
 

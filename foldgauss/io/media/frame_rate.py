@@ -36,12 +36,12 @@ class FrameRate(NamedTuple):
 def are_rising_seconds(values: object) -> bool:
     """Whether `values` are seconds at which frames are shown: numbers that rise from 0 to at most `MAX_SECONDS`."""
     try:
-        seconds = np.asarray(values, np.float64)
+        seconds = np.asarray(values)
     except (TypeError, ValueError, OverflowError):
         return False
-    if isinstance(values, str) or seconds.ndim != 1 or not len(seconds) or seconds[0] != 0:
+    if seconds.dtype.kind not in "fiu" or seconds.ndim != 1 or not len(seconds) or seconds[0] != 0:
         return False
-    return bool((np.diff(seconds) > 0).all() and seconds[-1] <= MAX_SECONDS)
+    return bool((np.diff(seconds.astype(np.float64)) > 0).all() and seconds[-1] <= MAX_SECONDS)
 
 
 def estimate_rate(seconds: Float[np.ndarray, " num_frames"], fps: float, end: float | None = None) -> FrameRate:

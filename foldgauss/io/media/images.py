@@ -17,12 +17,11 @@ from foldgauss._runtime.checks import require
 from foldgauss.io.media.clip import (
     MAX_PIXELS,
     ClipFacts,
-    Levels,
     VideoError,
+    check_decoded,
     clamp_stop,
     format_num_bytes,
     format_size,
-    no_frames_error,
     video_error,
 )
 from foldgauss.io.media.frame_rate import DEFAULT_FPS
@@ -86,15 +85,13 @@ def natural_sort_key(name: str) -> tuple:
 
 
 def scan_folder(
-    folder: Path, start: int, stop: int | None, keep: Callable[[Iterator[np.ndarray]], Sized], levels: Levels
+    folder: Path, start: int, stop: int | None, keep: Callable[[Iterator[np.ndarray]], Sized]
 ) -> tuple[Sized, ClipFacts]:
     """What `keep` makes of the images of a folder from `start` up to `stop`, and the facts."""
     names = [path.name for path in choose_images(folder, 0, None)]
     end = clamp_stop(start, stop, len(names), folder)
-    kept = keep(read_images([folder / name for name in names[start:end]], levels))
-    grid = np.arange(end)
-    notes = list(levels.describe(folder))
-    return kept, ClipFacts("folder", DEFAULT_FPS, len(names), grid, grid, 1 / DEFAULT_FPS, notes=notes, names=names)
+    kept = keep(read_images([folder / name for name in names[start:end]]))
+    return kept, ClipFacts("folder", DEFAULT_FPS, len(names), np.arange(end), 1 / DEFAULT_FPS, names=names)
 
 
 # ----------------------------------------------------------------------------------------- single images
@@ -118,11 +115,11 @@ def is_bare_jpegs(path: Path, head: bytes) -> bool:
         return data.find(b"\xff\xd9\xff\xd8\xff") >= 0
 
 
-def read_images(paths: list[Path], levels: Levels) -> Iterator[np.ndarray]:
+def read_images(paths: list[Path]) -> Iterator[np.ndarray]:
     """Images of one size."""
     first_shape = None
     for path in paths:
-        image = read_image(path, levels)
+        image = read_image(path)
         first_shape = first_shape or image.shape[:2]
         require(
             image.shape[:2] == first_shape,
@@ -158,10 +155,9 @@ def open_image(path: Path, file: BinaryIO | None = None) -> Image.Image:
     return image
 
 
-def read_image(path: Path, levels: Levels) -> np.ndarray:
+def read_image(path: Path) -> np.ndarray:
     """One image as uint8 BGR, shape (height, width, 3), or premultiplied BGRA, (height, width, 4), if any pixel is
-    transparent. `levels` converts those of 16 bits, and then records their largest value.
-    """
+    transparent."""
     data = path.read_bytes()
     # The rest of an image that does not decode is None, or raises anything.
     with silence_opencv(), warnings.catch_warnings(action="ignore"), open_image(path, io.BytesIO(data)) as header:
@@ -178,7 +174,7 @@ def read_image(path: Path, levels: Levels) -> np.ndarray:
     if image is None:
         raise undecodable_error(path)
     if image.dtype == np.uint16:
-        image = levels.convert(image)
+        image = to_8_bits(image)
     require(
         image.dtype == np.uint8,
         "path",
@@ -193,6 +189,11 @@ def read_image(path: Path, levels: Levels) -> np.ndarray:
     extra = tags.get(_EXTRA_SAMPLES)
     is_premultiplied = extra == (1,) or (extra == (2,) and tags.get(_BITS, (8,))[0] == 8)
     return drop_opaque(image) if is_premultiplied else premultiply(image)
+
+
+def to_8_bits(image: np.ndarray) -> np.ndarray:
+    """uint8 from uint16, to nearest."""
+    return ((image.astype(np.uint32) * 255 + 32767) // 65535).astype(np.uint8)
 
 
 def drop_opaque(image: np.ndarray) -> np.ndarray:
@@ -219,7 +220,7 @@ def undecodable_error(path: Path) -> VideoError:
 
 
 def scan_picture(
-    path: Path, start: int, stop: int | None, keep: Callable[[Iterator[np.ndarray]], Sized], levels: Levels
+    path: Path, start: int, stop: int | None, keep: Callable[[Iterator[np.ndarray]], Sized]
 ) -> tuple[Sized, ClipFacts]:
     """What `keep` makes of an image, or of the frames of an animation from `start` up to `stop`, and the facts.
 
@@ -238,26 +239,21 @@ def scan_picture(
             kind=VideoError,
         )
         if image.format == "GIF" or (image.format in ("PNG", "WEBP") and num > 1):
-            return _scan_animation(image, num, path, start, stop, keep, levels)
+            return _scan_animation(image, num, path, start, stop, keep)
     clamp_stop(start, stop, 1, path)
-    kept = keep(read_images([path], levels))
-    first = np.zeros(1, np.int64)
-    return kept, ClipFacts("pictures", DEFAULT_FPS, 1, first, first, 1.0, notes=list(levels.describe(path)))
+    kept = keep(read_images([path]))
+    return kept, ClipFacts("pictures", DEFAULT_FPS, 1, np.zeros(1, np.int64), 1.0)
 
 
-def _scan_animation(animation, num_declared, path, start, stop, keep, levels) -> tuple[Sized, ClipFacts]:
+def _scan_animation(animation, num_declared, path, start, stop, keep) -> tuple[Sized, ClipFacts]:
     delays: list[float] = []
     kept = keep(_decode_animation(animation, start, min(num_declared or MAX_FRAMES, stop or MAX_FRAMES), delays))
     if not delays:
         raise undecodable_error(path)
     num_total = num_declared or len(delays) + (len(delays) < (stop or MAX_FRAMES))
-    clamp_stop(start, stop, num_total, path)
-    if not len(kept):
-        raise no_frames_error(start, stop, len(delays), num_total, path)
-    levels.describe(path)
+    check_decoded(len(kept), start, stop, len(delays), num_total, path)
     ends = np.rint(1000 * np.cumsum([0, *delays])).astype(np.int64)  # microseconds
-    facts = ClipFacts("pictures", None, num_total, np.arange(len(delays)), ends[:-1], 1e-6, end=float(ends[-1]) * 1e-6)
-    return kept, facts
+    return kept, ClipFacts("pictures", None, num_total, ends[:-1], 1e-6, end=float(ends[-1]) * 1e-6)
 
 
 def _decode_animation(animation: Image.Image, start: int, stop: int, delays: list[float]) -> Iterator[np.ndarray]:

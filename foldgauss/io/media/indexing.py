@@ -1,38 +1,31 @@
 """Random access to the frames of a clip, equal to the bit to sequential reading: an index made in one pass, by which
 any span is decoded without starting at the first frame, and an array of frames that are decoded on access."""
 
-import ctypes
-import gc
 import hashlib
 import json
 import operator
 import os
 import threading
-import weakref
 from collections.abc import Callable, Iterator
 from contextlib import closing
 from pathlib import Path
 
 import cv2
 import numpy as np
-from jaxtyping import Int, UInt8
+from jaxtyping import UInt8
 
-from foldgauss._runtime.checks import short_repr
+from foldgauss._runtime.checks import require, short_repr
 from foldgauss.io._atomic import PathLike, atomic_path, check_path
 from foldgauss.io.media.clip import (
     Clip,
     ClipFacts,
-    Levels,
     Range,
-    Reading,
     Size,
     VideoError,
-    check_fps,
     check_frame_size,
     check_range,
     check_range_within,
     check_readable,
-    check_reading,
     translate_os_errors,
     video_error,
 )
@@ -42,7 +35,7 @@ from foldgauss.io.media.reading import describe_crop, resize_frame, scan_clip, s
 from foldgauss.video.motion.optical_flow import CutFinder
 
 DIGEST_BYTES = 16
-_FORMAT = 7
+_FORMAT = 8
 #: Frames before the wanted one at which a seek aims, in turn: after a seek into the middle of a stream, frames may show
 #: artifacts until the next key frame.
 MARGINS = (0, 16, 64, 256, 1024, 4096, 16384)
@@ -59,17 +52,16 @@ class FrameIndex:
     """The index of a clip; made by `index_video`.
 
     `source`: the path as given. `kind`: "video", "folder" or "pictures" (an animation, or one image). `num_frames`,
-    `fps`, `times`, `duration`, `first_second`, `num_declared`, `notes`, `reading`, `stretched`: as in `Clip`. `size`:
-    (height, width) of the frames. `has_alpha`: whether any frame is transparent anywhere. `cuts`: the frames, in order,
+    `fps`, `times`, `duration`, `first_second`, `num_declared`, `notes`: as in `Clip`. `size`: (height, width)
+    of the frames. `has_alpha`: whether any frame is transparent anywhere. `cuts`: the frames, in order,
     that begin a new shot; empty where they were not searched for. `digest`: of all frames as stored, in hexadecimal; it
-    shows whether a file is still the one that was indexed. `positions`: int64 (num_frames,), the position of each frame
-    in the range: k for frame k, except in a clip that lost frames to damage.
+    shows whether a file is still the one that was indexed.
 
     About 40 bytes per frame. It can be pickled, and saved with `save`.
     """
 
     # Beyond these, for the reader: `path`, absolute; `start`, the first frame of the range in the file; `facts` of all
-    # frames decoded, from the file's first on, of which `num_before` are before the range; `digests` of those indexed.
+    # frames decoded, from the file's first on; `digests` of those indexed.
 
     def __init__(self, about: dict, facts: ClipFacts, digests: UInt8[np.ndarray, "num_frames 16"]):
         """`about`: JSON types."""
@@ -78,16 +70,12 @@ class FrameIndex:
         self.path = Path(about["path"])
         self.start: int = about["start"]
         self.stop: int | None = about["stop"]
-        self.fixed_fps: float | None = about["fixed_fps"]
         self.size: Size = tuple(about["size"])
         self.has_alpha: bool = about["has_alpha"]
         self.cuts: list[int] = list(about["cuts"])
-        self.reading = Reading(**about["reading"])
-        self.kind, self.stretched = facts.kind, facts.stretched
-        self.num_frames, self.num_before = len(digests), len(facts.positions) - len(digests)
-        self.positions: Int[np.ndarray, " num_frames"] = facts.positions[self.num_before :] - self.start
-        span = self.num_before, len(facts.positions), self.start, self.stop
-        self.num_declared, rate, self.notes = facts.describe_span(*span, self.fixed_fps)
+        self.kind = facts.kind
+        self.num_frames, end = len(digests), len(facts.stamps)
+        self.num_declared, rate, self.notes = facts.describe_span(self.start, end, self.stop)
         self.fps, self.times, self.first_second = float(rate.fps), rate.times, rate.first_second
         self.duration = rate.duration
         self.last_margin = 0  # of the reader's last seek, in frames
@@ -102,14 +90,8 @@ class FrameIndex:
         whole.update(self.digests.tobytes())
         return whole.hexdigest()
 
-    def span(self, first: int, stop: int) -> tuple[int, int]:
-        """The range, for `read_video`, of the frames `first` up to `stop` of those that decode: the same numbers except
-        in a damaged clip, and from the index's first frame on. Raises `VideoError` for frames that do not exist."""
-        first, stop = self.check_frames(first, stop)
-        return int(self.positions[first]), int(self.positions[stop - 1]) + 1
-
     def check_frames(self, first: int, stop: int | None) -> tuple[int, int]:
-        """A range of frames that decode. Raises `VideoError` for one that is empty or beyond the clip."""
+        """A range of the frames indexed. Raises `VideoError` for one that is empty or beyond the clip."""
         first, stop = check_range((operator.index(first), self.num_frames if stop is None else operator.index(stop)))
         check_range_within(first, stop, self.num_frames, self.source)
         return first, stop
@@ -117,11 +99,10 @@ class FrameIndex:
     def save(self, path: PathLike) -> Path:
         """Write to a file (.npz), whole or not at all; returns the path. Raises `OutputError`."""
         path, facts = check_path(path), vars(self.facts)
-        arrays = {name: facts[name] for name in ("positions", "stamps")}
-        about = {"format": _FORMAT, **self._about, "facts": {k: v for k, v in facts.items() if k not in arrays}}
+        about = {"format": _FORMAT, **self._about, "facts": {k: v for k, v in facts.items() if k != "stamps"}}
         about = np.frombuffer(json.dumps(about).encode(), np.uint8)
         with atomic_path(path) as temporary, open(temporary, "wb") as file:
-            np.savez(file, about=about, digests=self.digests, **arrays)
+            np.savez(file, about=about, digests=self.digests, stamps=self.facts.stamps)
         return path
 
     @classmethod
@@ -131,12 +112,12 @@ class FrameIndex:
         try:
             # The file is opened here, because NumPy leaves a damaged one open.
             with open(path, "rb") as opened, np.load(opened, allow_pickle=False) as file:
-                about, digests, positions, stamps = (file[k] for k in ("about", "digests", "positions", "stamps"))
+                about, digests, stamps = (file[k] for k in ("about", "digests", "stamps"))
             about = json.loads(about.tobytes())
-            is_whole = 0 < len(digests) <= len(positions) == len(stamps) and digests.shape[1] == DIGEST_BYTES
+            is_whole = 0 < len(digests) <= len(stamps) and digests.shape[1] == DIGEST_BYTES
             if about.pop("format") != _FORMAT or not is_whole:
                 raise ValueError("format")
-            return cls(about, ClipFacts(**about.pop("facts"), positions=positions, stamps=stamps), digests)
+            return cls(about, ClipFacts(**about.pop("facts"), stamps=stamps), digests)
         except FileNotFoundError:
             raise
         except Exception as error:  # its type depends on the damage
@@ -156,25 +137,19 @@ def index_video(
     path: PathLike,
     *,
     frames: Range | None = None,
-    fps: float | None = None,
     on_frame: Callable[[], object] = lambda: None,
     find_cuts: bool = True,
-    deinterlace: str = "frames",
-    levels: int | None = None,
 ) -> FrameIndex:
     """Decode a clip once, frame by frame, and return its index. Memory: a few frames, and some 100 bytes per frame.
 
-    `path`, `fps`, `deinterlace` and `levels` as in `read_video`, with the same errors. `frames = (A, B)` restricts the
-    clip to A <= i < B; the index counts from A. `on_frame()` is called after each frame that is kept. `find_cuts`:
-    search for frames that begin a new shot, as `foldgauss.video.motion.optical_flow.Motion.cuts` does.
+    `path` as in `read_video`, with the same errors. `frames = (A, B)` restricts the clip to A <= i < B; the index
+    counts from A. `on_frame()` is called after each frame that is kept. `find_cuts`: search for frames that begin a new
+    shot, as `foldgauss.video.motion.optical_flow.Motion.cuts` does.
 
     Raises `FileNotFoundError` for a missing path, `VideoError` for everything else that cannot be read.
     """
     path = check_readable(path)
     start, stop = check_range(frames)
-    reading = check_reading(deinterlace, levels)
-    if fps is not None:
-        check_fps(fps)
     digests, has_alpha, finder = bytearray(), False, CutFinder() if find_cuts else None
 
     def record(image: np.ndarray) -> Size:
@@ -188,17 +163,15 @@ def index_video(
         return image.shape[:2]
 
     with translate_os_errors(path):
-        sizes, facts = scan_clip(path, start, stop, lambda images: list(map(record, images)), reading)
+        sizes, facts = scan_clip(path, start, stop, lambda images: list(map(record, images)))
     about = {
         "source": str(path),
         "path": os.path.abspath(path),
         "start": start,
         "stop": stop,
-        "fixed_fps": None if fps is None else float(fps),
         "size": sizes[-1],
         "has_alpha": has_alpha,
         "cuts": [] if finder is None else finder.found,
-        "reading": reading.changed,
     }
     return FrameIndex(about, facts, np.frombuffer(bytes(digests), np.uint8).reshape(-1, DIGEST_BYTES))
 
@@ -206,52 +179,40 @@ def index_video(
 # ----------------------------------------------------------------------------------------------- access
 
 
-def read_indexed(index: FrameIndex, first: int, stop: int | None = None, *, size: Size | None = None) -> Clip:
+def read_indexed(
+    index: FrameIndex, first: int, stop: int | None = None, *, size: Size | None = None, lazy: bool = False
+) -> Clip:
     """Frames `first` up to `stop` of an indexed clip, without decoding from the start: equal to the bit to
-    `read_video(path, frames=index.span(first, stop), size=size)`.
+    `read_video(path, frames=(first, stop), size=size)`, counted from the index's first frame on.
 
-    The range counts frames that decode. `stop=None`: to the end. Where any frame of the whole clip is transparent, the
-    result has alpha, even if none of its own frames is. Every frame is compared with the index.
+    `stop=None`: to the end. Where any frame of the whole clip is transparent, the result has alpha, even if none of its
+    own frames is. Every frame is compared with the index. `lazy`: the frames are `LazyFrames`.
 
     Raises `FileNotFoundError` for a missing path; `VideoError` for a range outside the clip, and a file that is not
     the one indexed.
     """
     first, stop = index.check_frames(first, stop)
-    with closing(LazyFrames(index, size, first, stop)) as lazy:
-        frames = lazy[:]
-    before, positions = index.num_before, (index.start + position for position in index.span(first, stop))
-    span = before + first, before + stop, *positions, index.fixed_fps
-    num_declared, rate, notes = index.facts.describe_span(*span)
+    frames = LazyFrames(index, size, first, stop)
+    if not lazy:
+        with closing(frames) as opened:
+            frames = opened[:]
+    span = index.start + first, index.start + stop
+    num_declared, rate, notes = index.facts.describe_span(*span, span[1])
     crop = () if size is None else describe_crop([index.size], size)
-    about = index.source, num_declared, rate.times, notes + crop, rate.first_second, rate.duration, index.reading
-    return Clip(frames, float(rate.fps), *about, index.stretched)
-
-
-_ALIVE: weakref.WeakSet["LazyFrames"] = weakref.WeakSet()
-
-
-def _begin_child() -> None:
-    """In a forked process never free the parent's decoders, which would wait for threads that a fork does not copy."""
-    gc.freeze()
-    for frames in list(_ALIVE):
-        ctypes.pythonapi.Py_IncRef(ctypes.py_object(frames._decoder))
-        frames._open()
-
-
-if hasattr(os, "register_at_fork"):
-    os.register_at_fork(after_in_child=_begin_child)
+    about = index.source, num_declared, rate.times, notes + crop, rate.first_second, rate.duration
+    return Clip(frames, float(rate.fps), *about)
 
 
 class LazyFrames:
     """The frames of an indexed clip as an array that is decoded on access.
 
     uint8 (num_frames, height, width, 3), or 4 channels where the clip has alpha: those of
-    `read_video(path, size=size).frames`, from `first` up to `stop`, which count frames that decode.
+    `read_video(path, size=size).frames`, from `first` up to `stop`.
 
     `frames[k]` and `frames[a:b]` return C-contiguous copies. Forward access decodes each frame about once; some frames
-    are cached for access to single ones. The object can be pickled, and read by several threads. A forked process opens
-    the file anew; spawned ones are safer, since a fork copies no threads. The file stays open until `close()` or until
-    the object is deleted. Reading raises what `read_indexed` does.
+    are cached for access to single ones. The object can be pickled, and read by several threads. A forked process has
+    no copy of the decoder's threads, and raises `VideoError`. The file stays open until `close()` or until the object
+    is deleted. Reading raises what `read_indexed` does.
     """
 
     dtype, ndim = np.dtype(np.uint8), 4
@@ -260,10 +221,7 @@ class LazyFrames:
         self._first, self._stop = index.check_frames(first, stop)
         self.index, self._size = index, check_frame_size(size)
         self.shape = self._stop - self._first, *(self._size or index.size), 4 if index.has_alpha else 3
-        self._open()
-        _ALIVE.add(self)
-
-    def _open(self) -> None:
+        self._process = os.getpid()
         self._decoder: VideoDecoder | None = None
         self._frames: Iterator = iter(())
         self._last: int | None = None  # number of the frame decoded last, among all frames of the file; None: unknown
@@ -272,9 +230,6 @@ class LazyFrames:
 
     def __reduce__(self) -> tuple:
         return LazyFrames, (self.index, self._size, self._first, self._stop)
-
-    def __repr__(self) -> str:
-        return f"LazyFrames({self.index.source!r}, shape={self.shape})"
 
     def close(self) -> None:
         """Close the file and drop the cache; the next access opens it again."""
@@ -288,6 +243,14 @@ class LazyFrames:
         return self.shape[0]
 
     def __getitem__(self, which: int | slice) -> np.ndarray:
+        require(
+            os.getpid() == self._process,
+            "frames[...]",
+            expected="the process that opened the clip",
+            got="one forked from it",
+            cure="Start processes with spawn.",
+            kind=VideoError,
+        )
         if isinstance(which, slice):
             chosen = range(len(self))[which]
             if chosen and chosen.step == 1:
@@ -312,11 +275,6 @@ class LazyFrames:
                 self._cache, self._cache_start = self._read(start, min(start + RUN, len(self))), start
             return self._cache[number - self._cache_start].copy()
 
-    def __array__(self, dtype=None, copy=None) -> np.ndarray:
-        if copy is False:
-            raise ValueError("copy: expected True or None for frames that are read from a file, got False.")
-        return np.asarray(self[:], dtype)
-
     def _read(self, first: int, stop: int) -> np.ndarray:
         """Frames `first` up to `stop`, each compared with the index."""
         index, first, stop = self.index, self._first + first, self._first + stop
@@ -337,10 +295,10 @@ class LazyFrames:
             if index.kind == "folder":
                 names = index.facts.names[index.start + first : index.start + stop]
                 paths = [index.path / name for name in names if (index.path / name).is_file()]
-                frames = keep(check(read_images(paths, Levels(index.reading.levels))))
+                frames = keep(check(read_images(paths)))
             else:
                 span = index.start + first, index.start + stop
-                frames, _ = scan_clip(index.path, *span, lambda images: keep(check(images)), index.reading)
+                frames, _ = scan_clip(index.path, *span, lambda images: keep(check(images)))
         if len(frames) < stop - first:
             raise _changed_error(index, first + len(frames))
         return frames
@@ -353,13 +311,13 @@ class LazyFrames:
         index, wanted = self.index, first
         for margin in self._margins(first):
             if margin is not None:
-                self._restart(index.num_before + wanted - margin)
-            for _, stamp, frame in self._frames:
+                self._restart(index.start + wanted - margin)
+            for stamp, frame in self._frames:
                 number = self._last = self._find_number(stamp)
-                if number is None or number < index.num_before + wanted:
+                if number is None or number < index.start + wanted:
                     continue
                 image = self._decoder.to_array(frame)
-                if number > index.num_before + wanted or not self._is_frame(wanted, image):
+                if number > index.start + wanted or not self._is_frame(wanted, image):
                     break
                 yield image
                 wanted += 1
@@ -372,21 +330,21 @@ class LazyFrames:
     def _margins(self, first: int) -> Iterator[int | None]:
         """Ways to reach a frame, fastest first: None (read on), or the number of frames before it at which to seek."""
         index = self.index
-        target = index.num_before + first
+        target = index.start + first
         ahead = target - self._last if self._last is not None else -1
         can_seek = np.ptp(index.facts.stamps) > 0  # a raw stream has no time stamps
         if 0 < ahead <= NEAR or (ahead > 0 and not can_seek):
             yield None
         if can_seek:
             yield from (margin for margin in MARGINS if index.last_margin <= margin < target)
-        yield len(index.facts.positions)
+        yield len(index.facts.stamps)
 
     def _restart(self, target: int) -> None:
         """Seek to a frame of the file; from the start where `target` is not positive."""
         index = self.index
         if target <= 0 or self._decoder is None:
             self.close()
-            self._decoder = VideoDecoder(index.path, index.facts.threads, index.reading)
+            self._decoder = VideoDecoder(index.path, index.facts.threads)
             self._last = -1
         if target > 0:
             self._decoder.seek(int(index.facts.stamps[target]))

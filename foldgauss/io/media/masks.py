@@ -9,7 +9,7 @@ from jaxtyping import Bool, UInt8
 
 from foldgauss._runtime.checks import check_within, is_integer, require
 from foldgauss.io._atomic import PathLike, check_input, check_path
-from foldgauss.io.media.clip import Range, Size, Stretch, check_frame_size, check_range, format_size
+from foldgauss.io.media.clip import Range, Size, check_range, format_size
 from foldgauss.io.media.images import IMAGE_SUFFIXES, choose_images, open_image, undecodable_error
 from foldgauss.io.media.reading import aspect_window, read_video
 from foldgauss.render.splats import check_size
@@ -29,7 +29,6 @@ def read_masks(
     frames: Range | None = None,
     size: Size | None = None,
     level: float = MASK_LEVEL,
-    stretched: Stretch | None = None,
 ) -> Bool[np.ndarray, "height width"] | Bool[np.ndarray, "num_frames height width"]:
     """The masks of an object, as `foldgauss.video.by_mask` takes them.
 
@@ -41,8 +40,7 @@ def read_masks(
 
     `frames = (A, B)` keeps A <= i < B of a folder or video, None for an open end, as `read_video`. `size` = (height,
     width) crops the masks to that aspect around the center, as `read_video` crops frames, without resizing them: use
-    the same value as for the fit. `stretched`: `Clip.stretched` of a clip whose pixels are not square; masks of the
-    size of its frames as stored are stretched as these are.
+    the same value as for the fit. Where pixels of the clip are not square, masks are of the size at which they are.
 
     **Example:** `by_mask(model, read_masks("DAVIS/Annotations/480p/bear", label=1))`.
 
@@ -88,10 +86,6 @@ def read_masks(
         for note in clip.notes:
             warnings.warn(f"{path}: {note}", stacklevel=2)
         masks = clip.over_black.max(-1) >= 255 * level
-    if stretched is not None:
-        stored, shown = (check_frame_size(one, "stretched") for one in stretched)
-        rows, columns = ((2 * np.arange(new) + 1) * old // (2 * new) for old, new in zip(stored, shown, strict=True))
-        masks = masks[..., rows[:, None], columns] if masks.shape[-2:] == stored else masks
     if size is None:
         return masks
     check_size(size)

@@ -13,16 +13,13 @@ from foldgauss.io._atomic import PathLike
 from foldgauss.io.media.clip import (
     Clip,
     ClipFacts,
-    Levels,
     Range,
-    Reading,
     Size,
     VideoError,
     check_fps,
     check_frame_size,
     check_range,
     check_readable,
-    check_reading,
     format_size,
     read_head,
     translate_os_errors,
@@ -42,8 +39,6 @@ def read_video(
     size: Size | None = None,
     fps: float | None = None,
     center_crop: Size | None = None,
-    deinterlace: str = "frames",
-    levels: int | None = None,
 ) -> Clip:
     """Read a video file, a folder of images in natural order (img2 before img10), or one image as a clip of one frame.
 
@@ -55,17 +50,14 @@ def read_video(
     and to the right). Frames are decoded one by one: memory is that of the output plus two source frames, and a clip
     that would take over a third of the machine's memory is refused. `Clip.notes` reports a `size` that crops much.
 
-    Images of 16 bits are scaled to 8, and so are videos of 10 or more; gray ones get three equal channels. `levels`:
-    the value of white in images and videos (RGB or gray) of 16 bits, 65,535 by default; 4095 for data of 12 bits, which
-    are dark otherwise, as `Clip.notes` reports. HDR videos (PQ, HLG) are tone-mapped to SDR (ITU-R BT.2390). Colors of
-    videos are converted by the matrix and the range that the file declares (BT.601 and limited where it does not), with
-    interpolated chroma.
+    Images of 16 bits are scaled to 8, and so are videos of 10 or more; gray ones get three equal channels. HDR videos
+    (PQ, HLG) are tone-mapped to SDR (ITU-R BT.2390). Colors of videos are converted by the matrix and the range that
+    the file declares (BT.601 and limited where it does not), with interpolated chroma.
 
     Where any frame is transparent anywhere, the clip has alpha (see `Clip`), and opaque frames get an alpha of 255.
-    Interlaced frames are converted to progressive ones by FFmpeg's bwdif. `deinterlace`: "frames" makes one of each,
-    "fields" two, one of each field, at twice the rate (50i becomes 50p), and "refuse" raises. Where pixels are not
-    square, frames are enlarged along one side until they are. Videos are rotated upright. A damaged one yields the
-    frames that decode; see `Clip.num_declared`. Unevenly spaced frames are all kept; see `Clip.times`.
+    Each interlaced frame is converted to a progressive one by FFmpeg's bwdif. Where pixels are not square, frames are
+    enlarged along one side until they are. Videos are rotated upright. A damaged one yields the frames that decode; see
+    `Clip.num_declared`. Unevenly spaced frames are all kept; see `Clip.times`.
 
     The format is detected from the first bytes, not from the name. No file or address that `path` refers to is opened,
     such as the entries of a playlist. Images of more than 178,956,970 pixels are refused by their header.
@@ -74,7 +66,6 @@ def read_video(
     """
     path = check_readable(path)
     start, stop = check_range(frames)
-    reading = check_reading(deinterlace, levels)
     size, center_crop = check_frame_size(size), check_frame_size(center_crop, "center_crop")
     sizes = set()
 
@@ -85,17 +76,16 @@ def read_video(
     if fps is not None:
         check_fps(fps)
     with translate_os_errors(path):
-        kept, facts = scan_clip(path, start, stop, lambda images: stack_frames(map(prepare, images)), reading)
-    num_decoded = len(facts.positions)
-    num_declared, rate, notes = facts.describe_span(num_decoded - len(kept), num_decoded, start, stop, fps)
+        kept, facts = scan_clip(path, start, stop, lambda images: stack_frames(map(prepare, images)))
+    num_declared, rate, notes = facts.describe_span(start, len(facts.stamps), stop, fps)
     if size is not None and center_crop is None:
         notes += describe_crop(sizes, size)
-    about = str(path), num_declared, rate.times, notes, rate.first_second, rate.duration, reading, facts.stretched
+    about = str(path), num_declared, rate.times, notes, rate.first_second, rate.duration
     return Clip(kept, float(rate.fps), *about)
 
 
 def scan_clip(
-    path: Path, start: int, stop: int | None, keep: Callable[[Iterator[np.ndarray]], Sized], reading: Reading
+    path: Path, start: int, stop: int | None, keep: Callable[[Iterator[np.ndarray]], Sized]
 ) -> tuple[Sized, ClipFacts]:
     """What `keep` makes of the frames of a clip from `start` up to `stop`, and the facts about the clip.
 
@@ -103,17 +93,9 @@ def scan_clip(
     """
     head = b"" if path.is_dir() else read_head(path)
     if not path.is_dir() and (not is_image(head) or is_bare_jpegs(path, head)):
-        return scan_video(path, start, stop, keep, reading)
-    require(
-        reading.deinterlace != "fields",
-        "deinterlace",
-        expected="a video of interlaced frames",
-        got=f"images, {str(path)!r}",
-        cure="Leave deinterlace='fields' out.",
-        kind=VideoError,
-    )
+        return scan_video(path, start, stop, keep)
     scan = scan_folder if path.is_dir() else scan_picture
-    return scan(path, start, stop, keep, Levels(reading.levels))
+    return scan(path, start, stop, keep)
 
 
 # -------------------------------------------------------------------------------------- sizes and memory

@@ -19,7 +19,7 @@ from av.filter import Graph
 from av.video.reformatter import ColorPrimaries, ColorRange, Colorspace, ColorTrc, VideoReformatter
 from PIL import Image
 
-from foldgauss._runtime.checks import check_one_of, check_within, invalid, is_integer, require, short_repr
+from foldgauss._runtime.checks import check_one_of, check_within, is_integer, require, short_repr
 from foldgauss.io._atomic import PathLike, atomic_folder, atomic_path, check_path, output_error
 from foldgauss.io.media.clip import VideoError, check_fps, check_readable, format_size, video_error
 from foldgauss.io.media.decoder import (
@@ -383,17 +383,21 @@ def choose_encoding(
     name = codec or DEFAULT_CODECS[suffix]
     check_one_of("codec", name, CODECS)
     chosen = CODECS[name]
-    if suffix not in chosen.suffixes:
-        fitting = [other for other, one in CODECS.items() if suffix in one.suffixes]
-        raise invalid(
-            "codec",
-            expected=f"{name} in one of {', '.join(chosen.suffixes)}",
-            got=f"{suffix}",
-            cure=f"For {suffix} take {', '.join(fitting)}.",
-        )
-    if min(shape[:2]) < chosen.min_side:
-        expected, got = f"at least {chosen.min_side}x{chosen.min_side} for {name}", f"{shape[0]}x{shape[1]}"
-        raise video_error("frames", expected=expected, got=f"{got} (height x width)", cure="Take h264, vp9 or ffv1.")
+    require(
+        suffix in chosen.suffixes,
+        "codec",
+        expected=f"{name} in one of {', '.join(chosen.suffixes)}",
+        got=suffix,
+        cure=f"For {suffix} take {', '.join(other for other, one in CODECS.items() if suffix in one.suffixes)}.",
+    )
+    require(
+        min(shape[:2]) >= chosen.min_side,
+        "frames",
+        expected=f"at least {chosen.min_side}x{chosen.min_side} for {name}",
+        got=format_size(shape),
+        cure="Take h264, vp9 or ffv1.",
+        kind=VideoError,
+    )
     if crf is not None:
         require(
             chosen.crf is not None,
@@ -532,7 +536,7 @@ def _make_sound_graph(
 def _first_shown(path: Path, of_file: av.AudioStream) -> float:
     """The time stamp in seconds of the first frame that decodes, or of the first sound where there is no video."""
     with suppress(VideoError, StopIteration), closing(VideoDecoder(path)) as decoder:
-        return float(next(decoder.frames())[1] * decoder.time_base)
+        return float(next(decoder.frames())[0] * decoder.time_base)
     return float((of_file.start_time or 0) * of_file.time_base)
 
 

@@ -36,8 +36,6 @@ def load_checkpoint(path: PathLike, *, config: FitConfig, source: dict) -> FitSt
         now, before = flatten(now), flatten(before if isinstance(before, dict) else {})
         changed = sorted(name for name in now.keys() | before.keys() if now.get(name) != before.get(name))
         cure = f"Resume {str(path)!r} with the options it was started with, or start a new fit with --overwrite."
-        if part == "config" and now.keys() != before.keys():
-            cure = "It is of another version of foldgauss: resume with that, or start a new fit with --overwrite."
         if changed:
             expected, got = (", ".join(f"{name}={one.get(name)!r}" for name in changed) for one in (before, now))
             raise invalid("overwrite", expected=expected, got=got, cure=cure)

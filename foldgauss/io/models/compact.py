@@ -13,7 +13,7 @@ import os
 import warnings
 import zlib
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any
 
 import jax
 import numpy as np
@@ -169,7 +169,7 @@ def load_compact(path: PathLike, *, visible: tuple[float, float] = (0.0, 1.0)) -
     """The quantized model in a compact file, for `foldgauss.video.compression.quantize.dequantize`.
 
     `visible`: the first and the last time that the model is needed for, in [0, 1]. Chunks of which nothing is visible
-    then are not read, and their Gaussians are missing; but the first chunk is always read.
+    then are not decoded, and their Gaussians are missing; but the first chunk always is.
 
     A chunk that is damaged or cut off is left out, with a warning. Raises `ModelFileError` for a file of which no chunk
     can be read, of another version or of another kind, ValueError for other times.
@@ -182,7 +182,7 @@ def load_compact(path: PathLike, *, visible: tuple[float, float] = (0.0, 1.0)) -
         expected="the first and the last time, in [0, 1]",
         got=short_repr(visible),
     )
-    return _load(path, visible, stacklevel=3)
+    return _load(path, path.read_bytes(), visible, stacklevel=3)
 
 
 def load_compact_model(path: Path, data: bytes | None = None) -> VideoModel:
@@ -192,23 +192,22 @@ def load_compact_model(path: Path, data: bytes | None = None) -> VideoModel:
     this one, `load_video_model`.
     """
     with np.errstate(over="ignore", invalid="ignore"):
-        model = dequantize(_load(path, (0.0, 1.0), data, stacklevel=4))
+        model = dequantize(_load(path, path.read_bytes() if data is None else data, stacklevel=4))
     finite = all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(model))
     _check_file(finite, path, "one with values beyond float32")
     return model
 
 
-def _load(path: Path, visible: tuple[float, float], data: bytes | None = None, *, stacklevel: int) -> Quantized:
-    with open(path, "rb") if data is None else io.BytesIO(data) as file:
-        header = _read_header(path, file)
-        try:
-            quantized, note = _decode(path, header, file, visible)
-        except HEADER_ERRORS as error:
-            if isinstance(error, ModelFileError):
-                raise
-            raise _unreadable(
-                path, f"one that does not fit together ({type(error).__name__}: {one_line(error)})"
-            ) from error
+def _load(path: Path, data: bytes, visible: tuple[float, float] = (0.0, 1.0), *, stacklevel: int) -> Quantized:
+    header = _read_header(path, data)
+    try:
+        quantized, note = _decode(path, header, data, visible)
+    except HEADER_ERRORS as error:
+        if isinstance(error, ModelFileError):
+            raise
+        raise _unreadable(
+            path, f"one that does not fit together ({type(error).__name__}: {one_line(error)})"
+        ) from error
     if note:
         warnings.warn(note, stacklevel=stacklevel)
     return quantized
@@ -216,24 +215,21 @@ def _load(path: Path, visible: tuple[float, float], data: bytes | None = None, *
 
 def compact_metadata(path: Path) -> dict:
     """The `metadata` that `save_compact` stored. Raises as `load_compact`."""
-    with open(path, "rb") as file:
-        return _read_header(path, file)["metadata"]
+    return _read_header(path, path.read_bytes())["metadata"]
 
 
 def measure_chunks(path: Path) -> tuple[list[int], int]:
     """Sizes of the chunks and of the file in bytes, as the header states them. The file itself may be cut off."""
-    with open(path, "rb") as file:
-        header = _read_header(path, file)
+    header = _read_header(path, path.read_bytes())
     sizes = [sum(own["streams"]) for own in header["chunks"]]
     return sizes, _FIXED + header["header_bytes"] + sum(header["motion"]["streams"]) + sum(sizes)
 
 
-def _read_header(path: Path, file: BinaryIO) -> dict:
-    """The header, once its checksum is verified; `file` is then at the first stream."""
-    data = file.read(_FIXED)
+def _read_header(path: Path, data: bytes) -> dict:
+    """The header of a file with this `data`, once its checksum is verified."""
     other = "one that a transfer as text has changed" if data.startswith(MAGIC[:4]) else "a file of another kind"
     _check_file(data.startswith(MAGIC), path, other)
-    _check_file(len(data) == _FIXED, path, f"one cut off after {len(data)} bytes")
+    _check_file(len(data) >= _FIXED, path, f"one cut off after {len(data)} bytes")
     version, length, checksum = (int.from_bytes(data[k : k + 4], "little") for k in range(len(MAGIC), _FIXED, 4))
     require(
         version == VERSION,
@@ -243,7 +239,7 @@ def _read_header(path: Path, file: BinaryIO) -> dict:
         cure="Compress the model again." if version < VERSION else "Update foldgauss.",
         kind=ModelFileError,
     )
-    text = file.read(min(length, _count_bytes(file)))
+    text = data[_FIXED : _FIXED + length]
     is_whole = length == len(text) and zlib.crc32(text) == checksum
     _check_file(is_whole, path, "one that is cut off or damaged (the checksum of its header is another)")
     try:
@@ -255,25 +251,17 @@ def _read_header(path: Path, file: BinaryIO) -> dict:
     return header | {"header_bytes": length}
 
 
-def _count_bytes(file: BinaryIO) -> int:
-    """The size of a file: to read more claims memory."""
-    here = file.tell()
-    size = file.seek(0, os.SEEK_END)
-    file.seek(here)
-    return size
-
-
 def _reject_constant(name: str) -> None:
     raise ValueError(f"{name} is not valid JSON")
 
 
-def _decode(path: Path, header: dict, file: BinaryIO, visible: tuple[float, float]) -> tuple[Quantized, str]:
+def _decode(path: Path, header: dict, data: bytes, visible: tuple[float, float]) -> tuple[Quantized, str]:
     """The model without the chunks that are not visible or cannot be read; and a warning of the latter, or ""."""
     info, num_frames = _parse_info(header), header["num_frames"]
     _check(is_integer(num_frames, 1), "num_frames", num_frames)
     _check_blocks(header, info)
     start = _FIXED + header["header_bytes"]
-    motion = _read_streams(file, header["motion"], start)
+    motion = _read_streams(data, header["motion"], start)
     _check_file(motion is not None, path, "one whose frame times are cut off or damaged")
     intervals = range_coder.decode(motion[0], range_coder.Column.without_contexts(num_frames - 1))
     paths = {} if info.paths is None else _decode_paths(info.paths, *motion[1:])
@@ -285,7 +273,7 @@ def _decode(path: Path, header: dict, file: BinaryIO, visible: tuple[float, floa
             first, last = own["visible"]
             if first > visible[1] or last < visible[0]:
                 continue
-        streams = _read_streams(file, own, start)
+        streams = _read_streams(data, own, start)
         if streams is None:
             missing.append(own["num_gaussians"])
         else:
@@ -329,16 +317,13 @@ def _check_streams(own: dict, num: int, num_values: int) -> int:
     return _count_lacking(num_values, sum(lengths))
 
 
-def _read_streams(file: BinaryIO, own: dict, start: int) -> list[bytes] | None:
+def _read_streams(data: bytes, own: dict, start: int) -> list[bytes] | None:
     """The streams of the block that begins at the byte `start`; None where they are cut off or damaged."""
     size = sum(own["streams"])
-    if start + size > _count_bytes(file):
+    block = data[start : start + size]
+    if len(block) < size or zlib.crc32(block) != own["crc"]:
         return None
-    file.seek(start)
-    data = file.read(size)
-    if len(data) < size or zlib.crc32(data) != own["crc"]:
-        return None
-    streams = io.BytesIO(data)
+    streams = io.BytesIO(block)
     return [streams.read(length) for length in own["streams"]]
 
 
@@ -373,8 +358,8 @@ def _decode_paths(about: PathsInfo, knots: bytes, maps: bytes) -> dict[str, np.n
 
 def _parse_info(header: dict) -> CompactInfo:
     size, degree = header["size"], header["degree"]
-    _check(isinstance(size, list) and len(size) == 2, "size", size)
-    _check(all(is_integer(side, 1) and side <= _SIDE for side in size), "size", size)
+    right = isinstance(size, list) and len(size) == 2 and all(is_integer(side, 1) and side <= _SIDE for side in size)
+    _check(right, "size", size)
     _check(is_integer(degree, 0) and degree <= MAX_DEGREE, "degree", degree)
     bounds = {"power": "[0, 1e30]", "floor": "[0, 1)", "reach": "(0, 100]", "fps": "(0, 1e9]", "scale_cutoff": "[0, 1]"}
     for name, interval in bounds.items():
@@ -411,13 +396,12 @@ def _parse_rules(described: list, info: CompactInfo) -> dict[str, Rule]:
     _check(isinstance(described, list) and len(described) == len(names), "rules", short_repr(described))
     described = dict(zip(names, described, strict=True))
     _check(not any(described[name] for name in names if is_integral(name)), "rules", "some of columns of integers")
-    return {name: _parse_rule(name, described[name]) for name in names if not is_integral(name)}
-
-
-def _parse_rule(name: str, numbers: list) -> Rule:
-    known = FEATURES.index(name) if name in FEATURES else len(FEATURES)
-    _check(2 <= len(numbers) <= 2 + known and all(is_within(x, "[-1e9, 1e9]") for x in numbers), "rule", name)
-    return Rule(numbers[0], numbers[1], tuple(numbers[2:]))
+    rules = {}
+    for name in (name for name in names if not is_integral(name)):
+        numbers, known = described[name], FEATURES.index(name) if name in FEATURES else len(FEATURES)
+        _check(2 <= len(numbers) <= 2 + known and all(is_within(x, "[-1e9, 1e9]") for x in numbers), "rule", name)
+        rules[name] = Rule(numbers[0], numbers[1], tuple(numbers[2:]))
+    return rules
 
 
 def _check(right: bool, name: str, got: Any) -> None:

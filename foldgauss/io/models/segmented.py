@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from foldgauss._runtime.checks import check_one_of, check_within, invalid, is_integer, require, short_repr
+from foldgauss._runtime.checks import check_one_of, check_within, is_integer, require, short_repr
 from foldgauss.io._atomic import PathLike, check_path, check_writable
 from foldgauss.io.models.compact import compact_metadata, is_compact, load_compact_model
 from foldgauss.io.models.model_file import (
@@ -19,7 +19,6 @@ from foldgauss.io.models.model_file import (
     load_model,
     load_part,
     match_kind,
-    model_file_error,
     open_tensors,
     read_header,
     save_model,
@@ -65,8 +64,14 @@ def join_segments(path: PathLike, sources: Sequence[tuple[int, PathLike]], *, me
         first, file = _source(number, source)
         load = partial(load_compact_model if is_compact(file) else load_model, file)
         about = _describe_compact(file, load()) if is_compact(file) else read_header(file)
-        if about["kind"] not in PARTS:
-            raise _unfit(file, f"one of kind {about['kind']!r}", "Join the files that it was made of.")
+        require(
+            about["kind"] in PARTS,
+            "sources",
+            expected="ordinary models",
+            got=f"one of kind {about['kind']!r}, {str(file)!r}",
+            cure="Join the files that it was made of.",
+            kind=ModelFileError,
+        )
         files.append(file)
         entries.append({"first": first} | {name: about[name] for name in ("kind", "header", "metadata")})
         specs |= {f"segments.{number}.{key}": spec for key, spec in about["tensors"].items()}
@@ -77,17 +82,10 @@ def join_segments(path: PathLike, sources: Sequence[tuple[int, PathLike]], *, me
     def tensors(keys: list[str]) -> Iterator[np.ndarray]:
         for number, some in groupby(keys, lambda key: int(_KEY.fullmatch(key)[1])):
             if entries[number]["kind"] == COMPACT:
-                array = np.fromfile(files[number], np.uint8)
-                if [len(array)] != specs[next(some)]["shape"]:
-                    raise _unfit(files[number], "one that has changed meanwhile", "Join them again.")
-                yield array
+                yield np.fromfile(files[number], np.uint8)
                 continue
             with open_tensors(files[number]) as file:
-                for key in some:
-                    array = file.get_tensor(_KEY.fullmatch(key)[2])
-                    if list(array.shape) != specs[key]["shape"]:
-                        raise _unfit(files[number], "one that has changed meanwhile", "Join them again.")
-                    yield array
+                yield from (file.get_tensor(_KEY.fullmatch(key)[2]) for key in some)
 
     about = {"kind": SEGMENTED, "header": {"segments": entries}, "metadata": metadata or {}}
     return write_tensors(path, specs, tensors, about)
@@ -109,19 +107,13 @@ def save_segmented(path: Path, video: SegmentedVideo, metadata: dict | None) -> 
 
 
 def _source(number: int, source: object) -> tuple[int, Path]:
-    try:
-        first, file = source
-    except (TypeError, ValueError):
-        raise invalid(
-            f"sources[{number}]", expected="(number of its first frame, model file)", got=short_repr(source)
-        ) from None
     require(
-        is_integer(first, 0),
+        isinstance(source, tuple | list) and len(source) == 2 and is_integer(source[0], 0),
         f"sources[{number}]",
-        expected="the number of its first frame first",
-        got=short_repr(first),
+        expected="(number of its first frame, model file)",
+        got=short_repr(source),
     )
-    return int(first), check_path(file, "path, sources")
+    return int(source[0]), check_path(source[1], "path, sources")
 
 
 def _describe_compact(file: Path, model: VideoModel) -> dict[str, Any]:
@@ -129,10 +121,6 @@ def _describe_compact(file: Path, model: VideoModel) -> dict[str, Any]:
     header = {name: getattr(model, name) for name in _FACTS} | {"options": dataclasses.asdict(model.options)}
     tensors = {_FILE: {"dtype": "U8", "shape": [file.stat().st_size]}}
     return {"kind": COMPACT, "header": header, "metadata": compact_metadata(file), "tensors": tensors}
-
-
-def _unfit(file: Path, got: str, cure: str) -> ModelFileError:
-    return model_file_error("sources", expected="ordinary models", got=f"{got}, {str(file)!r}", cure=cure)
 
 
 # ---------------------------------------------------------------------------------------------- loading
@@ -176,16 +164,11 @@ def _segments(path: Path, about: dict) -> list[Segment]:
         )
         if entries[number]["kind"] == COMPACT:
             named = path.with_name(f"{path.name}, segment {number + 1}")  # for messages
-            return load_compact_model(named, _read_file(path, number))
+            with open_tensors(path) as file:
+                return load_compact_model(named, file.get_tensor(f"segments.{number}.{_FILE}").tobytes())
         return load_part(path, entries[number] | {"tensors": own[number]}, f"segments.{number}.")
 
     return [_segment(path, entry, own[number], partial(load, number)) for number, entry in enumerate(entries)]
-
-
-def _read_file(path: Path, number: int) -> bytes:
-    """The bytes of a compact segment's file."""
-    with open_tensors(path) as file:
-        return file.get_tensor(f"segments.{number}.{_FILE}").tobytes()
 
 
 def _stamp(path: Path) -> tuple[int, ...]:

@@ -22,14 +22,12 @@ from foldgauss._runtime.checks import (
 )
 from foldgauss.envelope import TimeLikelihood
 from foldgauss.io._atomic import PathLike, check_path
-from foldgauss.io.media.clip import AS_STORED, check_frame_size, check_reading
 from foldgauss.io.media.frame_rate import are_rising_seconds
 from foldgauss.io.models.compact import COMPACT_SUFFIX, compact_metadata, is_compact, load_compact_model
 from foldgauss.io.models.model_file import (
     Kind,
     ModelFileError,
     load_part,
-    model_file_error,
     read_header,
     register_model,
     save_model,
@@ -47,7 +45,7 @@ from foldgauss.video.segmented.segmented_video import SegmentedVideo
 
 MODEL_SUFFIX = ".safetensors"
 #: Metadata of which frames of which clip a model shows, and when the clip shows them.
-CLIP_NOTES = ("clip", "frames", "frame_seconds", "first_second", "reading", "stretched")
+CLIP_NOTES = ("clip", "frames", "frame_seconds", "first_second")
 
 
 def save_video_model(
@@ -60,15 +58,13 @@ def save_video_model(
     The name ends in .safetensors, or has no extension. Raises ValueError for another one, `ModelFileError` for edits
     that hold code: `apply`, `apply_triangles`, a camera that is a function.
     """
-    require(
-        not isinstance(model, Edit), "model", expected="a video", got="a chain of edits", cure="End it with .video()."
-    )
     check_path(path, "path, model")
     require(
         isinstance(model, VideoModel | EditedVideo | SegmentedVideo),
         "model",
         expected="a VideoModel, an EditedVideo or a SegmentedVideo",
         got=type(model).__name__,
+        cure="End the chain with .video()." if isinstance(model, Edit) else "",
     )
     check_model_name(path)
     if isinstance(model, SegmentedVideo):
@@ -132,42 +128,17 @@ def read_frame_seconds(about: dict, num_frames: int) -> np.ndarray | None:
     return None if seconds is None or len(seconds) != num_frames + 1 else np.array(seconds, np.float64)
 
 
-def _are_numbers(values: list) -> bool:
-    return all(is_within(one, "[0, inf)") for one in values)
-
-
 def _is_range(value: object) -> bool:
     """Whether these are frames A up to, not including, B, as `read_video` takes them."""
-    if not isinstance(value, list) or len(value) != 2:
-        return False
-    if not all(end is None or is_integer(end, 0) for end in value):
-        return False
-    return value[1] is None or value[1] > (value[0] or 0)
-
-
-def _is_reading(value: object) -> bool:
-    """Whether these are options of `read_video`, as `Reading.changed` returns them."""
-    try:
-        return bool(check_reading(**AS_STORED._replace(**value)._asdict()))
-    except (TypeError, ValueError):
-        return False
-
-
-def _is_stretch(value: object) -> bool:
-    """Whether these are two sizes of frames, as `Clip.stretched`."""
-    try:
-        return len(value) == 2 and all(isinstance(one, list) and check_frame_size(one) for one in value)
-    except (TypeError, ValueError):
-        return False
+    right = isinstance(value, list) and len(value) == 2 and all(end is None or is_integer(end, 0) for end in value)
+    return right and (value[1] is None or value[1] > (value[0] or 0))
 
 
 #: Metadata that `fit` and `compress` write and later commands read, with their checks.
 _NOTES: dict[str, Callable[[object], bool]] = {
     **dict.fromkeys(("clip", "frames_digest", "clip_digest"), lambda value: isinstance(value, str)),
     "frames": _is_range,
-    "reading": _is_reading,
-    "stretched": _is_stretch,
-    "frame_seconds": lambda value: isinstance(value, list) and _are_numbers(value) and are_rising_seconds(value),
+    "frame_seconds": lambda value: isinstance(value, list) and are_rising_seconds(value),
     "first_second": lambda value: is_within(value, "[0, inf)"),
     "seed": lambda value: is_integer(value, 0),
     "mean_psnr": lambda value: is_within(value, "(0, 100]"),
@@ -177,11 +148,14 @@ _NOTES: dict[str, Callable[[object], bool]] = {
 def read_header_of_kind(path: PathLike, *kinds: str) -> dict:
     """The header of a file of one of these kinds; raises `ModelFileError` for another kind."""
     about = read_header(path)
-    if about["kind"] not in kinds:
-        expected, cure = " or ".join(map(repr, kinds)), "Give the file that `foldgauss fit` wrote to --out."
-        raise model_file_error(
-            "path", expected=f"a model of kind {expected}", got=f"{about['kind']!r} in {str(path)!r}", cure=cure
-        )
+    require(
+        about["kind"] in kinds,
+        "path",
+        expected=f"a model of kind {' or '.join(map(repr, kinds))}",
+        got=f"{about['kind']!r} in {str(path)!r}",
+        cure="Give the file that `foldgauss fit` wrote to --out.",
+        kind=ModelFileError,
+    )
     return about
 
 
@@ -214,9 +188,8 @@ def _video_skeleton(header: dict) -> VideoModel:
     counts_fit = all(is_integer(count, 1) for count in (num, num_frames, height, width)) and is_integer(degree, 0)
     require(counts_fit, "size", expected="sizes and counts above 0", got=short_repr(header))
     check_within("fps", header["fps"], "(0, inf)", "a rate above 0")
-    compositing = header.get("compositing", "over")  # files from before there was another
-    check_one_of("compositing", compositing, COMPOSITINGS)
-    check_within("scale_cutoff", header.get("scale_cutoff", 0.0), "[0, 1]", "a number in [0, 1]")
+    check_one_of("compositing", header["compositing"], COMPOSITINGS)
+    check_within("scale_cutoff", header["scale_cutoff"], "[0, 1]", "a number in [0, 1]")
     row_width = columns(degree)["coefficients"].stop
     num_paths, num_knots = header.get("paths", (0, 0))
     paths_fit = not num_paths or (is_integer(num_paths, 1) and num_paths <= MAX_PATHS and is_integer(num_knots, 1))
@@ -236,8 +209,8 @@ def _video_skeleton(header: dict) -> VideoModel:
             size=(height, width),
             fps=float(header["fps"]),
             options=RenderOptions(**header["options"]),
-            compositing=compositing,
-            scale_cutoff=float(header.get("scale_cutoff", 0.0)),
+            compositing=header["compositing"],
+            scale_cutoff=float(header["scale_cutoff"]),
         )
 
     return jax.eval_shape(build)  # traced, not computed: nothing is allocated

@@ -96,7 +96,7 @@ def write_html(
     file = linked_file(path, model) if linked else None
     title, name = path.stem if title is None else title, None if file is None else file.name
     page = html_page(model, original=original, quality=quality, title=title, linked=name)
-    warn_of_size(page, original is not None)
+    warn_of_size(page)
     if file is not None and not (isinstance(model, PathLike) and file.exists() and file.samefile(model)):
         loaded, _, metadata = _load(model)
         with atomic_path(file) as temporary:
@@ -113,12 +113,10 @@ def linked_file(path: Path, model: Model) -> Path:
     return path.with_name(f"{path.stem}.page{COMPACT_SUFFIX}")  # of no model that someone keeps
 
 
-def warn_of_size(page: str, has_original: bool) -> None:
+def warn_of_size(page: str) -> None:
     """Warn of a page that browsers open slowly."""
     if len(page) > LARGE:
-        cure = "Compress the model, or show a part."
-        if has_original:
-            cure = "Leave the original out, or lower its quality."
+        cure = "Compress the model, show a part, or leave the original out."
         warnings.warn(f"page: {len(page) / 1e6:.0f} MB, which browsers are slow to open. {cure}", stacklevel=3)
 
 
@@ -195,15 +193,12 @@ def empty_page() -> str:
 
 def make_notebook_iframe(model: VideoModel | EditedVideo | SegmentedVideo) -> str | None:
     """The page as an iframe for notebooks; None where it is too large or the model cannot be shown."""
-    blocks: list[str] = []
+    if model.num_parameters > LARGEST_IN_NOTEBOOK:  # each takes more than a byte
+        return None
     try:
-        for block in _encode_model(model, model, {}):
-            blocks.append(block)
-            if sum(map(len, blocks)) > LARGEST_IN_NOTEBOOK:
-                return None
+        page = html_page(model)
     except (ValueError, OSError):  # the file of a video in segments may be gone
         return None
-    page = _assemble(blocks, "foldgauss")
     if len(page) > LARGEST_IN_NOTEBOOK:
         return None
     height, width = model.size
