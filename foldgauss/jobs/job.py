@@ -204,9 +204,8 @@ def make_jobs(
     Checkpoints and records go to the folder `RECORDS` in `out`, which must exist.
     """
     out, config = Path(out).absolute(), FitConfig() if config is None else config
-    jobs = []
-    for clip in clips:
-        job = FitJob(
+    return [
+        FitJob(
             clip.name,
             str(clip.absolute()),
             str(out / f"{clip.name}{COMPACT_SUFFIX if config.is_compact else MODEL_SUFFIX}"),
@@ -217,5 +216,5 @@ def make_jobs(
             folder=str(out / RECORDS),
             source=stamp_clip(clip),
         )
-        jobs.append(job)
-    return jobs
+        for clip in clips
+    ]

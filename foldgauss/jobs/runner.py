@@ -7,7 +7,6 @@ import dataclasses
 import itertools
 import json
 import os
-import sys
 import time
 import warnings
 from collections.abc import Callable, Iterable
@@ -277,13 +276,8 @@ def fit_job(job: FitJob, report: Report = lambda info: True) -> dict[str, Any]:
 
 
 def peak_bytes() -> int | None:
-    """The largest resident memory of this process so far; None where the system does not provide it."""
-    # Linux, where `ru_maxrss` is at least that of the process that started this one.
+    """The largest resident memory of this process so far; None where the system is not Linux."""
+    # Not `resource.getrusage`, whose `ru_maxrss` is at least that of the process that started this one.
     with suppress(OSError, StopIteration), open("/proc/self/status", "rb") as status:
         return 1024 * next(int(line.split()[1]) for line in status if line.startswith(b"VmHWM:"))
-    try:
-        import resource
-    except ImportError:  # Windows
-        return None
-    most = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    return most if sys.platform == "darwin" else 1024 * most
+    return None

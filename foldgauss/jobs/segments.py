@@ -7,12 +7,13 @@ import shutil
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from functools import partial
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from foldgauss._runtime.checks import invalid, is_integer, is_within, require
+from foldgauss._runtime.checks import is_integer, is_within, require
 from foldgauss._runtime.settings import flatten
 from foldgauss.io import FrameIndex, index_video, join_segments, read_indexed
 from foldgauss.io._atomic import OutputError, atomic_path
@@ -61,14 +62,13 @@ class LongFit:
         """
         for job in self.jobs:
             if file_digest(job.target) != records[job.name]["file_digest"]:
-                got = f"a changed {job.target!r}"
-                expected, cure = f"{job.name} as it was written", "Run the same command again to fit it again."
-                raise OutputError(str(invalid("path", expected=expected, got=got, cure=cure)))
+                text = f"path: expected {job.name} as it was written, got a changed {job.target!r}."
+                raise OutputError(f"{text} Run the same command again to fit it again.")
         sources = [(first, job.target) for (first, _), job in zip(self.spans, self.jobs, strict=True)]
         scores = np.zeros((2, self.spans[-1][1]))  # shared frames take those of the later segment
         for (first, stop), job in zip(self.spans, self.jobs, strict=True):
             scores[:, first:stop] = records[job.name]["psnr"], records[job.name]["ssim"]
-        fades = [(b, stop) for (_, stop), (b, _) in zip(self.spans[:-1], self.spans[1:], strict=True) if b < stop]
+        fades = [(first, stop) for (_, stop), (first, _) in pairwise(self.spans) if first < stop]
         if fades:
             self._score_fades(sources, fades, scores, on_frame)
         joined = Evaluation(*map(tuple, scores.tolist()))
@@ -184,9 +184,8 @@ def plan_long_fit(
     with atomic_path(folder / _PLAN) as temporary:
         temporary.write_text(json.dumps(kept) + "\n")
     begin = 0 if frames is None else frames[0] or 0
-    jobs = []
-    for number, (span, own) in enumerate(zip(spans, configs, strict=True)):
-        job = FitJob(
+    jobs = tuple(
+        FitJob(
             name=f"segment {number}",
             clip=str(clip),
             target=str(folder / f"segment-{number:04d}{target.suffix or MODEL_SUFFIX}"),
@@ -199,8 +198,9 @@ def plan_long_fit(
             source={"digest": index.digest},
             metadata={"clip": clip.name, "frames": [begin + span[0], begin + span[1]]},
         )
-        jobs.append(job)
-    return LongFit(target, folder, index, tuple(spans), tuple(jobs), metadata)
+        for number, (span, own) in enumerate(zip(spans, configs, strict=True))
+    )
+    return LongFit(target, folder, index, tuple(spans), jobs, metadata)
 
 
 def _divide_size(config: FitConfig, spans: Sequence[tuple[int, int]], metadata: Mapping[str, Any]) -> list[FitConfig]:

@@ -19,7 +19,7 @@ from contextlib import ExitStack, contextmanager, suppress
 from multiprocessing import resource_tracker
 from typing import TYPE_CHECKING, Any
 
-from foldgauss._runtime.checks import invalid, is_integer, require
+from foldgauss._runtime.checks import is_integer, require
 from foldgauss._runtime.optional_imports import import_optional
 from foldgauss._runtime.threads import available_cores
 from foldgauss.jobs.job import FitJob, read_record
@@ -182,9 +182,8 @@ def running_cluster(address: str) -> Iterator["Client"]:
             client = distributed.Client(address, set_as_default=False, timeout=CONNECT_SECONDS)
         except (OSError, TimeoutError, ValueError) as error:
             got = f"{address!r}, which does not answer ({one_line(error)})"
-            cure = "Start one: dask scheduler; dask worker ADDRESS --nthreads 1."
-            text = str(invalid("scheduler", expected="the address of a running scheduler", got=got, cure=cure))
-            raise SchedulerLost(text) from error
+            text = f"scheduler: expected the address of a running scheduler, got {got}."
+            raise SchedulerLost(f"{text} Start one: dask scheduler; dask worker ADDRESS --nthreads 1.") from error
         with client:
             yield client
 
@@ -261,7 +260,7 @@ def _outcome(future: Any, job: FitJob) -> Outcome:
     if future.status == "cancelled":
         raise SchedulerLost(_LOST)
     try:
-        return Outcome(job, *future.result())
+        return future.result()
     except CancelledError as error:
         raise SchedulerLost(_LOST) from error
     except Stopped:
@@ -281,8 +280,8 @@ _NONE_THERE = "start some, dask worker ADDRESS --nthreads 1, and run the command
 _LOST = "The scheduler does not answer any more. Finished jobs are kept: start one, and run the command again."
 
 
-def _run_on_worker(job: FitJob, topic: str) -> tuple[dict[str, Any] | None, str | None]:
-    """Runs on a worker: the record of a job, or its failure."""
+def _run_on_worker(job: FitJob, topic: str) -> Outcome:
+    """Runs on a worker: the outcome of a job."""
     from distributed import Event, get_worker
 
     worker = get_worker()
@@ -292,5 +291,4 @@ def _run_on_worker(job: FitJob, topic: str) -> tuple[dict[str, Any] | None, str 
         worker.log_event(topic, (job.name, *info))
         return not stop.is_set()
 
-    outcome = _run_job(job, report)
-    return outcome.record, outcome.failure
+    return _run_job(job, report)

@@ -29,6 +29,7 @@ from foldgauss._runtime.kernels import inline, kernel
 TILE = 16
 PIXELS = TILE * TILE
 _SHIFT = 4  # log2(TILE)
+_CELL_SHIFT = 2  # log2(CELL)
 #: Side of a cell in pixels; the pixels of a cell are one vector.
 CELL = 4
 #: Side of a tile in cells. The cost of a splat is the number of cells that it meets: compact shapes meet a third fewer
@@ -66,10 +67,10 @@ BLOCK = 64
 # The first column of colors.
 _COLOR = 8
 # Sums of a gradient slot: of dL/dalpha * alpha times 1, v, w, v^2, v w, w^2, where v = P dx + Q dy and w = R dy (in
-# whitened coordinates the moments of thin splats do not cancel either), then the colors'; padded to whole vectors.
+# whitened coordinates the moments of thin splats do not cancel either), then the colors'; padded to a vector.
 _MOMENTS = 6
-#: Channels that are kept in registers; further ones go through memory.
-FEW = 4
+#: Channels of one image at most, which are kept in registers.
+MOST_CHANNELS = 4
 # Planes of the scratch: the transmittance; then, forward, the colors; backward, from here on the color from behind
 # (times the incoming gradient),
 _BEHIND = PIXELS
@@ -77,11 +78,6 @@ _BEHIND = PIXELS
 _G = 2 * PIXELS
 # What the backward pass stores for each cell of a splat: a vector of alphas and a vector of weights.
 _STORED = 2 * LANES
-
-
-def slot_width(channels: int) -> int:
-    """Floats of a gradient slot."""
-    return -(-(_MOMENTS + channels) // LANES) * LANES
 
 
 @inline
@@ -201,10 +197,11 @@ def _load_geometry(geometry, num, which, left, top, block):
 
 
 @kernel
-def _find_tiles(num, block, upper, lower, width, first, end):
-    """Exact ellipse-tile test: tiles first <= k < end of a band that the block's splats reach.
+def _find_squares(num, block, upper, lower, width, shift, first, end):
+    """Squares first <= k < end of a band that the block's splats reach, 2^shift pixels wide.
 
-    `upper` and `lower`: the y of the band's first and last pixel centers.
+    `upper` and `lower`: the y of the band's first and last pixel centers. Exact for the rectangle of a square's pixel
+    centers.
     """
     for e in range(_u(num)):
         x, y = block[_u(_X * BLOCK) + e], block[_u(_Y * BLOCK) + e]
@@ -212,11 +209,13 @@ def _find_tiles(num, block, upper, lower, width, first, end):
         level = _level(block[_u(_LOG * BLOCK) + e], block[_u(_LEAST * BLOCK) + e])
         # Within the band the ellipse is widest on the line nearest to its turning point.
         turn = block[_u(_TURN * BLOCK) + e]
-        right = x + _right_edge(p, q, r, level, min(max(turn, upper - y), lower - y))
-        left = x - _right_edge(p, -q, r, level, min(max(-turn, upper - y), lower - y))
-        column, stop = _pixel_range(left - _f(0.5), right - _f(0.5), width)
-        first[e] = column >> _i(_SHIFT)
-        end[e] = max((stop + _i(TILE - 1)) >> _i(_SHIFT), first[e]) if stop > column else first[e]
+        on_right, on_left = min(max(turn, upper - y), lower - y), min(max(-turn, upper - y), lower - y)
+        left, right = x - _right_edge(p, -q, r, level, on_left), x + _right_edge(p, q, r, level, on_right)
+        column, stop = _pixel_range(left, right, width)
+        # The line nearest to the turning point meets the ellipse if any line of the band does.
+        reached = (stop > column) & (r * on_right * r * on_right <= level)
+        first[e] = column >> shift
+        end[e] = (stop + (_i(1) << shift) - _i(1)) >> shift if reached else first[e]
 
 
 @kernel
@@ -226,24 +225,21 @@ def _bucket_tiles(geometry, row_start, entries, begin, end, height, width):
     count = row_start[end] - base
     first, after = np.empty(count, np.int32), np.empty(count, np.int32)
     block, which = _aligned_empty(8 * BLOCK), np.empty(BLOCK, np.int32)
-    # The difference between a tile's number of entries and that of the tile to its left.
-    more = np.zeros((end - begin, across + 1), np.int64)
+    tile_start = np.zeros((end - begin) * across + 1, np.int64)
     for row in range(begin, end):
-        upper, lower = _f(row * TILE) + _f(0.5), _f(min((row + 1) * TILE, height)) - _f(0.5)
+        upper, lower = _f(row * TILE), _f(min((row + 1) * TILE, height) - 1)
         for start in range(row_start[row] - base, row_start[row + 1] - base, BLOCK):
             stop = min(start + BLOCK, row_start[row + 1] - base)
             which[: stop - start] = entries[base + start : base + stop]
-            _load_geometry(geometry, stop - start, which, _f(0.0), _f(0.0), block)
-            _find_tiles(stop - start, block, upper, lower, _f(width), first[start:stop], after[start:stop])
+            _load_geometry(geometry, stop - start, which, _f(0.5), _f(0.5), block)
+            own_first, own_after = first[start:stop], after[start:stop]
+            _find_squares(stop - start, block, upper, lower, _f(width), _i(_SHIFT), own_first, own_after)
+            left = (row - begin) * across
             for e in range(start, stop):
-                more[row - begin, first[e]] += 1
-                more[row - begin, after[e]] -= 1
-    tile_start = np.zeros((end - begin) * across + 1, np.int64)
-    for row in range(end - begin):
-        here = 0
-        for tile in range(across):
-            here += more[row, tile]
-            tile_start[row * across + tile + 1] = tile_start[row * across + tile] + here
+                for tile in range(left + first[e], left + after[e]):
+                    tile_start[tile + 1] += 1
+    for tile in range(len(tile_start) - 1):
+        tile_start[tile + 1] += tile_start[tile]
     fill = tile_start.copy()
     listed = np.empty(tile_start[-1], np.int32)
     for row in range(begin, end):
@@ -253,29 +249,6 @@ def _bucket_tiles(geometry, row_start, entries, begin, end, height, width):
                 listed[fill[tile]] = e
                 fill[tile] += 1
     return tile_start, listed
-
-
-@kernel
-def _find_cells(num, block, first, end):
-    """Cells first <= k < end of every band of cells that the block's splats reach, band after band.
-
-    Exact for the rectangle of a cell's pixel centers.
-    """
-    for band in range(_u(CELLS)):
-        upper, at = _f(_i(band) * _i(CELL)), band * _u(BLOCK)
-        lower = upper + _f(CELL - 1)
-        for e in range(_u(num)):
-            x, y = block[_u(_X * BLOCK) + e], block[_u(_Y * BLOCK) + e]
-            p, q, r = block[_u(_P * BLOCK) + e], block[_u(_Q * BLOCK) + e], block[_u(_R * BLOCK) + e]
-            level = _level(block[_u(_LOG * BLOCK) + e], block[_u(_LEAST * BLOCK) + e])
-            turn = block[_u(_TURN * BLOCK) + e]
-            on_right, on_left = min(max(turn, upper - y), lower - y), min(max(-turn, upper - y), lower - y)
-            left, right = x - _right_edge(p, -q, r, level, on_left), x + _right_edge(p, q, r, level, on_right)
-            column, stop = _pixel_range(left, right, _f(TILE))
-            # The line nearest to the turning point meets the ellipse if any line of the band does.
-            reached = (stop > column) & (r * on_right * r * on_right <= level)
-            first[at + e] = column // _i(CELL)
-            end[at + e] = (stop + _i(CELL - 1)) // _i(CELL) if reached else _i(0)
 
 
 @inline
@@ -299,9 +272,11 @@ def _load_block(geometry, color, background, entries, listed, left, top, block, 
         for c in range(_u(len(background))):
             block[_u(_COLOR * BLOCK) + c * _u(BLOCK) + e] = color[i, c]
     _load_geometry(geometry, len(listed), which, left + _f(0.5), top + _f(0.5), block)
-    _find_cells(len(listed), block, first, end)
     for band in range(CELLS):
-        end[band * BLOCK + len(listed) : (band + 1) * BLOCK] = 0
+        upper, begin, stop = _f(band * CELL), band * BLOCK, (band + 1) * BLOCK
+        lower, own_first, own_end = upper + _f(CELL - 1), first[begin:stop], end[begin:stop]
+        _find_squares(len(listed), block, upper, lower, _f(TILE), _i(_CELL_SHIFT), own_first, own_end)
+        own_end[len(listed) :] = 0
 
 
 @inline
@@ -316,7 +291,7 @@ def _offsets(block, e, x, y):
 def _composite(num, block, first, end, shear, rise, scratch, background, over, ceiling, finished):
     """Composite a block's splats onto the tile: scratch holds transmittance, then colors, cell after cell.
 
-    A cell's transmittance and first FEW colors stay in registers while the splats that reach it, one bit each, are
+    A cell's transmittance and colors stay in registers while the splats that reach it, one bit each, are
     composited in turn; `shear` and `rise` are buffers for P dx + Q dy and R dy at its first pixel.
     """
     attenuation, highest = broadcast(_f(1.0) if over else _f(0.0)), broadcast(ceiling)
@@ -362,10 +337,6 @@ def _composite(num, block, first, end, shear, rise, scratch, background, over, c
                 c_2nd = c_2nd + weight * broadcast(block[color + _u(2 * BLOCK) + e])
             if channels > _u(3):
                 c_3rd = c_3rd + weight * broadcast(block[color + _u(3 * BLOCK) + e])
-            if channels > _u(FEW):
-                for c in range(_u(FEW), channels):
-                    own = weight * broadcast(block[color + c * _u(BLOCK) + e])
-                    store(scratch, plane + c * _u(PIXELS), load(scratch, plane + c * _u(PIXELS)) + own)
         store(scratch, base, transmittance)
         store(scratch, plane, c_0th)
         if channels > _u(1):
@@ -444,7 +415,7 @@ def forward_rows(
 ):
     """Composite rows begin..end of tiles into `image` (channels, height, width) and `transmittance` (height, width).
 
-    `background` is a tuple of up to FEW channels, so that the loop over channels is unrolled, or an array.
+    `background` is a tuple, so that the loop over channels is unrolled.
 
     Returns the tiles' lists (start, entries relative to the rows' first, the end of those composited), and the
     transmittance of every pixel of a tile at the start of each block but the first, tile after tile.
@@ -453,11 +424,9 @@ def forward_rows(
     across = (width + TILE - 1) // TILE
     tile_start, listed = _bucket_tiles(geometry, row_start, entries, begin, end, height, width)
     entries = entries[row_start[begin] : row_start[end]]
-    num_stored = 0  # blocks but the first of each tile: the backward pass needs the transmittance at their start
-    for tile in range(len(tile_start) - 1):
-        num_stored += max((tile_start[tile + 1] - tile_start[tile] + BLOCK - 1) // BLOCK - 1, 0)
+    num_stored = len(listed) // BLOCK if over else 0  # at most so many blocks are not the first of their tile
     used = np.empty(len(tile_start) - 1, np.int64)
-    block_transmittances = np.empty((num_stored if over else 0, PIXELS), np.float32)
+    block_transmittances = np.empty((num_stored, PIXELS), np.float32)
     scratch, block = _aligned_empty((1 + len(background)) * PIXELS), _aligned_empty((_COLOR + len(background)) * BLOCK)
     first, after = np.empty(CELLS * BLOCK, np.int32), np.empty(CELLS * BLOCK, np.int32)
     shear, rise = _aligned_empty(BLOCK), _aligned_empty(BLOCK)
@@ -529,12 +498,12 @@ def _store_alphas(num_items, items, shear, rise, block, scratch, stored, over, c
 
 
 @kernel
-def _add_gradients(begin, end, items, shear, rise, e, block, scratch, stored, background, over, flat, many, slot):
+def _add_gradients(begin, end, items, shear, rise, e, block, scratch, stored, background, over, flat, slot):
     """Add the gradient sums of splat e, items begin..end of a tile, to its slot, and composite it over `behind`.
 
     With B the color behind the splat per unit of transmittance, times the incoming gradient, dL/dalpha = T (c . g - B):
     nothing is divided by 1 - alpha, which may be 0. `flat`: the alpha at which `_store_alphas` capped it; from there on
-    it does not depend on the exponent. `many`: a buffer for the sums of the channels beyond FEW.
+    it does not depend on the exponent.
     """
     num, limit, none = _u(len(background)), broadcast(flat), broadcast(_f(0.0))
     x, y, color = cell_columns(), cell_rows(), _u(_COLOR * BLOCK) + e
@@ -542,9 +511,6 @@ def _add_gradients(begin, end, items, shear, rise, e, block, scratch, stored, ba
     slope_y = broadcast(block[_u(_R * BLOCK) + e]) * y
     s_1, s_v, s_w, s_vv, s_vw, s_ww = none, none, none, none, none, none
     s_0th, s_1st, s_2nd, s_3rd = none, none, none, none
-    if num > _u(FEW):
-        for c in range(num - _u(FEW)):
-            store(many, c * _u(LANES), none)
     for n in range(begin, end):
         base, note = _u(items[n] >> _i(8)) * _u(LANES), n * _u(_STORED)
         alpha, weight = load(stored, note), load(stored, note + _u(LANES))
@@ -565,11 +531,6 @@ def _add_gradients(begin, end, items, shear, rise, e, block, scratch, stored, ba
             grad = load(scratch, plane + _u(3 * PIXELS))
             own = own + broadcast(block[color + _u(3 * BLOCK)]) * grad
             s_3rd = s_3rd + weight * grad
-        if num > _u(FEW):
-            for c in range(num - _u(FEW)):
-                grad = load(scratch, plane + (c + _u(FEW)) * _u(PIXELS))
-                own = own + broadcast(block[color + (c + _u(FEW)) * _u(BLOCK)]) * grad
-                store(many, c * _u(LANES), load(many, c * _u(LANES)) + weight * grad)
         gain = own
         if over:
             behind = load(scratch, base + _u(_BEHIND))
@@ -587,12 +548,6 @@ def _add_gradients(begin, end, items, shear, rise, e, block, scratch, stored, ba
     first = add_lanes(add_lanes(pairs[0], pairs[1], 2), add_lanes(pairs[2], pairs[3], 2), 4)
     second = add_lanes(add_lanes(add_lanes(s_2nd, s_3rd, 1), none, 2), none, 4)
     store(slot, _u(0), load(slot, _u(0)) + add_lanes(first, second, 8))
-    if num > _u(FEW):
-        for c in range(num - _u(FEW)):
-            total = _f(0.0)
-            for k in range(_u(LANES)):
-                total += many[c * _u(LANES) + k]
-            slot[_u(_MOMENTS + FEW) + c] += total
 
 
 @kernel
@@ -625,7 +580,7 @@ def backward_rows(
     items, shear, rise = np.empty(size, np.int32), np.empty(size, np.float32), np.empty(size, np.float32)
     first, after = np.empty(CELLS * BLOCK, np.int32), np.empty(CELLS * BLOCK, np.int32)
     stop = np.empty(BLOCK, np.uint64)
-    stored, many = _aligned_empty(BLOCK * CELLS * CELLS * _STORED), _aligned_empty(max(channels - FEW, 0) * LANES)
+    stored = _aligned_empty(BLOCK * CELLS * CELLS * _STORED)
     kept = len(block_transmittances)
     for tile in range(len(used) - 1, -1, -1):
         top, left = (begin + tile // across) * TILE, tile % across * TILE
@@ -657,7 +612,7 @@ def backward_rows(
                 start_of_own, own = stop[e - 1] if e else _u(0), slots[part[e]]
                 _add_gradients(
                     *(start_of_own, stop[e], items, shear, rise, _u(e), block, scratch, stored),
-                    *(background, over, flat, many, own),
+                    *(background, over, flat, own),
                 )
 
 
@@ -678,15 +633,13 @@ def gather(
 ):
     """Sum the slots of splats start..stop and convert them to gradients of mean, factor, opacity and color."""
     c = _f(2.0 * math.log(2.0))
-    channels = d_color.shape[1]
-    total = np.empty(slots.shape[1], np.float32)
+    total = np.empty(LANES, np.float32)
     for i in range(start, stop):
         total[:] = 0.0
         for s in range(first_slot[i], first_slot[i + 1]):
             slot = slots[slot_position[s]]
-            for k in range(_u(0), _u(slots.shape[1]), _u(LANES)):
-                store(total, k, load(total, k) + load(slot, k))
-        for k in range(channels):
+            store(total, _u(0), load(total, _u(0)) + load(slot, _u(0)))
+        for k in range(d_color.shape[1]):
             d_color[i, k] = total[_MOMENTS + k]
         if first_slot[i] == first_slot[i + 1]:
             d_opacity[i] = 0.0
@@ -730,10 +683,7 @@ def list_weights(
     Without `indices`, the number of weights of each pixel is written to `at`; with it, the weights, from at[pixel] on.
     """
     across = (width + TILE - 1) // TILE
-    most = 0
-    for n in range(len(used)):
-        most = max(most, used[n] - tile_start[n])
-    which, on_row = np.empty(most, np.int32), np.empty((most, 4), np.float32)
+    which, on_row = np.empty(len(listed), np.int32), np.empty((len(listed), 4), np.float32)
     for n in range(len(used)):
         top, left = (begin + n // across) * TILE, n % across * TILE
         for y in range(top, min(top + TILE, height)):

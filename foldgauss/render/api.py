@@ -156,7 +156,11 @@ def _run_engine(splats, background, size, compositing, engine, options):
     if engine != "cpu" and not len(leaves[2]):
         image = jnp.broadcast_to(leaves[4][None, None, :], (*size, len(leaves[4])))
     elif engine == "cpu":
-        image = _render_cpu(size, compositing, options, *leaves)
+        parts = [slice(k, k + cpu.MOST_CHANNELS) for k in range(0, len(leaves[4]), cpu.MOST_CHANNELS)]
+        images = [
+            _render_cpu(size, compositing, options, *leaves[:3], leaves[3][:, part], leaves[4][part]) for part in parts
+        ]
+        image = jnp.concatenate(images, -1)
     else:
         module = xla if engine == "xla" else pallas
         image = render_rounds(module.ENGINE, module.choose_plan(leaves, size, compositing, options), leaves)

@@ -28,6 +28,7 @@ from foldgauss.render.splats import RenderOptions, check_size
 
 TILE = kernels.TILE
 PIXELS = kernels.PIXELS
+MOST_CHANNELS = kernels.MOST_CHANNELS
 SPLATS_PER_TASK = 8192
 STANDARD = RenderOptions()
 #: Estimated nanoseconds to composite one entry of a row of tiles.
@@ -79,7 +80,7 @@ def forward(
 
     Returns the trace: its `image` is planar, (channels, height, width).
     A splat with a parameter that is not finite is left out and gets no gradient. One kernel is compiled for each
-    number of channels from 1 to 4, and one for all larger numbers. Raises ValueError for a tile size other than this
+    number of channels, from 1 to 4. Raises ValueError for a tile size other than this
     engine's, a size below 1, and arrays that are not float32 or whose shapes do not match.
     """
     check_options(options)
@@ -113,7 +114,7 @@ def forward(
     run_tasks(fill, chunks)
     image, transmittance = np.empty((channels, *size), np.float32), np.empty(size, np.float32)
     constants = (
-        tuple(np.asarray(background, np.float32)) if channels <= kernels.FEW else background,
+        tuple(background),
         over,
         np.float32(options.alpha_ceiling),
         np.float32(options.transmittance_stop if over else 0.0),
@@ -140,9 +141,9 @@ def _check_leaves(mean, factor, opacity, color, background) -> None:
     num, channels = shapes[2][:1], shapes[4][:1]
     expected = [(*num, 2), (*num, 2, 2), num, (*num, *channels), channels]
     require(
-        shapes == expected and channels != (0,) and (num and channels),
+        shapes == expected and num and channels and 0 < channels[0] <= MOST_CHANNELS,
         names,
-        expected="shapes (num, 2), (num, 2, 2), (num,), (num, channels), (channels,), at least one channel",
+        expected=f"shapes (num, 2), (num, 2, 2), (num,), (num, channels), (channels,), 1 to {MOST_CHANNELS} channels",
         got=", ".join(map(str, shapes)),
     )
     require(
@@ -172,7 +173,7 @@ def backward(trace: Trace, grad_image: np.ndarray) -> tuple[np.ndarray, ...]:
         got=grad_image.shape,
     )
     grad_image, num, channels = _read_only(grad_image), len(trace.geometry), len(trace.image)
-    slots = np.empty((len(trace.buckets[1]), kernels.slot_width(channels)), np.float32)  # of every (splat, row)
+    slots = np.empty((len(trace.buckets[1]), kernels.LANES), np.float32)  # of every (splat, row)
     grads = tuple(np.empty(shape, np.float32) for shape in ((num, 2), (num, 2, 2), (num,), (num, channels)))
 
     def sum_rows(part: int) -> None:

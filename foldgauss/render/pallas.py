@@ -74,9 +74,8 @@ def check_options(options: RenderOptions) -> None:
 
 def is_preferred(options: RenderOptions) -> bool:
     """Whether engine "auto" should use this one: a GPU that it compiles for is JAX's default device."""
-    if default_platform() != "gpu" or CompilerParams is None:
-        return False
-    return options.tile_size in (None, *TILES) and options.alpha_ceiling <= HIGHEST_CEILING
+    supported = options.tile_size in (None, *TILES) and options.alpha_ceiling <= HIGHEST_CEILING
+    return supported and default_platform() == "gpu" and CompilerParams is not None
 
 
 def choose_tile_size(size: tuple[int, int], capacity: int | None = None) -> int:

@@ -128,12 +128,10 @@ def project(plan: Plan, mean, factor, opacity) -> Projected:
     seen = valid & (reach >= 0) & jnp.all(jnp.isfinite(mean), axis=1)
     reach = jnp.where(seen, reach * (1 + SLACK) + SLACK, jnp.zeros_like(reach))
     radius_x, radius_y = jnp.sqrt(reach * jnp.where(seen, xx, 1)), jnp.sqrt(reach * jnp.where(seen, yy, 1))
-    firsts, shapes = [], []
-    for axis, radius, length in ((1, radius_y, plan.size[0]), (0, radius_x, plan.size[1])):
-        first, last = _tiles_between(mean[:, axis] - radius, mean[:, axis] + radius, length, plan.tile)
-        firsts.append(first)
-        shapes.append(jnp.where(seen, last - first, 0))
-    return Projected(whitener, reach, radius_x, jnp.stack(firsts), jnp.stack(shapes))
+    center, radius = mean.T[::-1], jnp.stack([radius_y, radius_x])
+    length = np.asarray(plan.size, mean.dtype)[:, None]
+    first, last = _tiles_between(center - radius, center + radius, length, plan.tile)
+    return Projected(whitener, reach, radius_x, first, jnp.where(seen[None], last - first, 0))
 
 
 def find_visible(mean, factor, opacity, size: tuple[int, int], options: RenderOptions) -> Bool[Array, " num"]:
@@ -142,8 +140,11 @@ def find_visible(mean, factor, opacity, size: tuple[int, int], options: RenderOp
     return project(plan, mean, factor, opacity).slots > 0
 
 
-def _tiles_between(low, high, length: int, tile: int):
-    """Tiles first <= k < last whose pixel centers lie within [low, high]; clipped before the cast to an integer."""
+def _tiles_between(low, high, length, tile: int):
+    """Tiles first <= k < last whose pixel centers lie within [low, high]; clipped before the cast to an integer.
+
+    Rows and columns: `low` and `high` (2, num), `length` (2, 1) in pixels.
+    """
     first = jnp.clip(jnp.ceil(low - 0.5), 0, length)
     last = jnp.clip(jnp.floor(high - 0.5), -1, length - 1)
     first_tile, last_tile = first.astype(jnp.int32) // tile, last.astype(jnp.int32) // tile

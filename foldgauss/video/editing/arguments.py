@@ -2,7 +2,9 @@
 
 import warnings
 from itertools import pairwise
+from typing import Any
 
+import equinox as eqx
 import numpy as np
 from jaxtyping import ArrayLike, Float64
 
@@ -56,6 +58,19 @@ def broadcast_numbers(parameter: str, values: ArrayLike, num: int) -> tuple[floa
     numbers = check_one_or_more(parameter, values)
     require(len(numbers) in (1, num), parameter, expected=f"one number or {num}", got=f"{len(numbers)}")
     return numbers if len(numbers) == num else numbers * num
+
+
+def static_numbers(parameter: str, *shape: int | None, optional: bool = False, **more: Any) -> Any:
+    """A static field of a module: finite numbers of a shape, as tuples; or None if `optional`."""
+
+    def convert(values):
+        return None if optional and values is None else _to_tuples(check_array(parameter, values, *shape).tolist())
+
+    return eqx.field(static=True, converter=convert, **more)
+
+
+def _to_tuples(values: Any) -> Any:
+    return tuple(map(_to_tuples, values)) if isinstance(values, list) else values
 
 
 def check_color_map(

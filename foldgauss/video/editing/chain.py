@@ -439,12 +439,17 @@ class Edit:
         return self._retime_linearly(shift, stretch, about, when, "shift")
 
     def _retime_by_clock(self, clock: Clock, when: When, parameter: str) -> "Edit":
-        """Add a clock."""
-        span, time_map = make_span(self._frame_times, **when), self._time_map
-        if time_map is not None and (span is None or time_map.convert_span(span) is not NEVER):
-            time_map.check_clock(clock, span, parameter, len(self._frame_times))
-            clock = time_map.convert_clock(clock)
-        return self._apply(partial(Retiming, clock=clock), when)
+        """Add a clock; in a segment it runs between two that convert the times, of which the last is applied first."""
+        time_map = self._time_map
+        if time_map is None or self._span(when) is NEVER:
+            return self._apply(partial(Retiming, clock=clock), when)
+        self._check_selected()
+        span, edited = make_span(self._frame_times, **when), self
+        time_map.check_clock(clock, span, parameter, len(self._frame_times))
+        for own_span, own_clock in ((None, time_map.to_own), (span, clock), (None, time_map.to_whole)):
+            make = partial(Retiming, span=own_span, clock=own_clock)
+            edited = edited._edit_layers(lambda layer, mask, make=make: apply_edit(layer, make(mask)))
+        return edited
 
     def _retime_linearly(self, shift: float, stretch: float, about: float, when: When, parameter: str) -> "Edit":
         """Show t at about + shift + stretch (t - about), baked where possible."""

@@ -22,9 +22,8 @@ from foldgauss.video.editing.overlays import (
     Retiming,
     SelectedGaussians,
     TimedEdit,
+    call_padded,
     is_active,
-    pad_rows,
-    padded_size,
 )
 from foldgauss.video.models.conditioning import PreparedModel
 from foldgauss.video.models.frame_times import is_cut, snap_to_shots
@@ -349,24 +348,23 @@ def _group_by_clocks(layer: Layer) -> list[tuple[tuple[Retiming, ...], Bool[np.n
 
 
 class _ConditionedLayer:
-    """The Gaussians of a layer at one time, to apply overlays to: in pixels, and in model space once one is in 3D."""
+    """The Gaussians of a layer at one time, to apply overlays to: in pixels, and their depths in model space."""
 
     def __init__(self, index, mean, factor, opacity, color, size: tuple[int, int], aspect: float):
         self.index, self.mean, self.factor, self.opacity, self.color = index, mean, factor, opacity, color
         height, width = size
         self._unit = np.float32(pixels_per_unit(size, aspect=aspect))
         self._middle = np.float32([width / 2, height / 2])
-        self._mean_3d = self._factor_3d = self._lifted = None  # of all Gaussians, once one is in 3D space
+        # The third row of means and factors, and which Gaussians are in 3D space.
+        self._depth, self._slant = np.zeros(len(index), np.float32), np.zeros((len(index), 2), np.float32)
+        self._lifted = np.zeros(len(index), bool)
 
     def edit(self, mask: Bool[np.ndarray, " num"], change: Callable[[SelectedGaussians], SelectedGaussians]) -> None:
         """Edit the selected Gaussians; all others keep their bits."""
         selected = np.flatnonzero(mask[self.index])
         if not selected.size:
             return
-        if self.in_space:
-            mean, factor = self._mean_3d[selected], self._factor_3d[selected]
-        else:
-            mean, factor = self._in_model_space(selected)
+        mean, factor = self._in_model_space(selected, in_space=self.in_space)
         leaves = self.index[selected], mean, factor, self.opacity[selected], self.color[selected]
         for leaf in leaves:  # a change in place would not be noticed
             leaf.setflags(write=False)
@@ -379,23 +377,20 @@ class _ConditionedLayer:
             return
         if self.in_space or after.mean.shape[1] == 3:
             after = after.in_space()
-            self._make_space()
-            self._mean_3d[selected], self._factor_3d[selected], self._lifted[selected] = after.mean, after.factor, True
-            return
+            self._depth[selected], self._slant[selected] = after.mean[:, 2], after.factor[:, 2]
+            self._lifted[selected] = True
         if after.mean is not before.mean:
-            self.mean[selected] = after.mean * self._unit + self._middle
+            self.mean[selected] = after.mean[:, :2] * self._unit + self._middle
         if after.factor is not before.factor:
-            self.factor[selected] = after.factor * self._unit
+            self.factor[selected] = after.factor[:, :2] * self._unit
 
     def visible(self) -> tuple[np.ndarray, ...]:
         """Mean, factor, opacity, color and depth, the z coordinate, of the Gaussians that are not transparent."""
-        depth = self._mean_3d[:, 2] if self.in_space else np.zeros(len(self.index), np.float32)
-        leaves, shown = (self.mean, self.factor, self.opacity, self.color, depth), self.opacity > 0
+        leaves, shown = (self.mean, self.factor, self.opacity, self.color, self._depth), self.opacity > 0
         return leaves if shown.all() else tuple(leaf[shown] for leaf in leaves)
 
     def lift_all(self) -> None:
         """Move all into 3D space, flat ones in the plane of the frame."""
-        self._make_space()
         self._lifted[:] = True
 
     def project(self, camera: Camera, size: tuple[int, int]) -> None:
@@ -403,29 +398,25 @@ class _ConditionedLayer:
         if not self.in_space:
             return
         lifted = np.flatnonzero(self._lifted)
-        num, rows = len(lifted), padded_size(len(lifted))
-        leaves = (pad_rows(leaf[lifted], rows) for leaf in (self._mean_3d, self._factor_3d, self.opacity))
-        projected = (np.asarray(leaf)[:num] for leaf in _project_padded(camera, size, *leaves))
+        leaves = (*self._in_model_space(lifted, in_space=True), self.opacity[lifted])
+        projected = call_padded(partial(_project, camera, size), *leaves)
         self.mean[lifted], self.factor[lifted], self.opacity[lifted] = projected
 
     @property
     def in_space(self) -> bool:
         """Whether a Gaussian is in 3D space."""
-        return self._lifted is not None
+        return bool(self._lifted.any())
 
-    def _make_space(self) -> None:
-        if not self.in_space:
-            num = len(self.index)
-            self._mean_3d, self._factor_3d = np.zeros((num, 3), np.float32), np.zeros((num, 3, 2), np.float32)
-            self._mean_3d[:, :2], self._factor_3d[:, :2] = self._in_model_space(slice(None))
-            self._lifted = np.zeros(num, bool)
-
-    def _in_model_space(self, selected: np.ndarray | slice) -> tuple[np.ndarray, np.ndarray]:
-        return (self.mean[selected] - self._middle) / self._unit, self.factor[selected] / self._unit
+    def _in_model_space(self, selected: np.ndarray, *, in_space: bool) -> tuple[np.ndarray, np.ndarray]:
+        mean, factor = (self.mean[selected] - self._middle) / self._unit, self.factor[selected] / self._unit
+        if not in_space:
+            return mean, factor
+        thirds = self._depth[selected, None], self._slant[selected, None]
+        return tuple(np.concatenate(pair, 1) for pair in zip((mean, factor), thirds, strict=True))
 
 
 @partial(jax.jit, static_argnums=1)
-def _project_padded(
+def _project(
     camera: Camera,
     size: tuple[int, int],
     mean: Float[Array, "num 3"],

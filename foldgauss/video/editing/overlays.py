@@ -5,6 +5,7 @@ are alive at a time and returns them changed; all others stay the same to the bi
 """
 
 import dataclasses
+import math
 from abc import abstractmethod
 from collections.abc import Callable
 from typing import Any
@@ -18,7 +19,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from foldgauss._runtime.checks import check_one_of, require
 from foldgauss.render import Gaussians3D, Triangles
-from foldgauss.video.editing.arguments import check_array
+from foldgauss.video.editing.arguments import static_numbers
 from foldgauss.video.editing.timing import Clock, Span
 
 #: Luminance of red, green and blue: Rec. 709.
@@ -99,19 +100,6 @@ class AbstractOverlay(TimedEdit):
         """The selected Gaussians of time t, edited with progress in [0, 1]: 0 is unchanged, 1 fully edited."""
 
 
-def _numbers(parameter: str, *shape: int, optional: bool = False, **more: Any) -> Any:
-    """A static field of finite numbers of a shape, as tuples; or None if `optional`."""
-
-    def convert(values):
-        return None if optional and values is None else _to_tuples(check_array(parameter, values, *shape).tolist())
-
-    return eqx.field(static=True, converter=convert, **more)
-
-
-def _to_tuples(values: Any) -> Any:
-    return tuple(map(_to_tuples, values)) if isinstance(values, list) else values
-
-
 class Affine(AbstractOverlay):
     r"""An affine map of the plane about a point, or about the selection's own center at each time.
 
@@ -123,10 +111,10 @@ class Affine(AbstractOverlay):
     **Units:** `angle` in radians from x to y, which is clockwise on the screen; `offset` and `about` model space.
     """
 
-    angle: float = _numbers("angle")
-    stretch: tuple[tuple[float, float], tuple[float, float]] = _numbers("stretch", 2, 2)
-    offset: tuple[float, float] = _numbers("offset", 2)
-    about: tuple[float, float] | None = _numbers("about", 2, optional=True)
+    angle: float = static_numbers("angle")
+    stretch: tuple[tuple[float, float], tuple[float, float]] = static_numbers("stretch", 2, 2)
+    offset: tuple[float, float] = static_numbers("offset", 2)
+    about: tuple[float, float] | None = static_numbers("about", 2, optional=True)
 
     def __check_init__(self) -> None:
         (first, shear), (other, second) = self.stretch
@@ -172,22 +160,18 @@ def polar_decompose(
     matrix: Float[np.ndarray, "2 2"],
 ) -> tuple[float, tuple[tuple[float, float], tuple[float, float]]]:
     """Angle of R and symmetric part S of A = R S; R is a rotation, so S mirrors where A does."""
-    if np.array_equal(matrix, matrix.T) and np.trace(matrix) >= 0:
-        return 0.0, tuple(map(tuple, matrix.tolist()))  # exactly A
-    left, sizes, right = np.linalg.svd(matrix)
-    flip = np.diag([1.0, np.sign(np.linalg.det(left @ right))])
-    turn = left @ flip @ right
-    stretch = right.T @ (flip * sizes) @ right
-    cross = float(stretch[0, 1])
-    rows = ((float(stretch[0, 0]), cross), (cross, float(stretch[1, 1])))
-    return float(np.arctan2(turn[1, 0], turn[0, 0])), rows
+    (a, b), (c, d) = matrix.tolist()
+    angle = math.atan2(c - b, a + d + 0.0)  # 0 where the sum is -0; with it R^T A is symmetric, its trace not negative
+    cos, sin = math.cos(angle), math.sin(angle)
+    cross = cos * b + sin * d
+    return angle, ((cos * a + sin * c, cross), (cross, cos * d - sin * b))
 
 
 class Opacity(AbstractOverlay):
     """Opacity times a factor, clipped at 1: `before` at progress 0, `factor` at progress 1, interpolated between."""
 
-    factor: float = _numbers("factor")
-    before: float = _numbers("before", default=1.0)
+    factor: float = static_numbers("factor")
+    before: float = static_numbers("before", default=1.0)
 
     def __check_init__(self) -> None:
         for name in ("factor", "before"):
@@ -211,9 +195,9 @@ class Recolor(AbstractOverlay):
     distance from gray are kept.
     """
 
-    matrix: tuple[tuple[float, float, float], ...] = _numbers("matrix", 3, 3)
-    offset: tuple[float, float, float] = _numbers("offset", 3)
-    hue: float | None = _numbers("hue", optional=True, default=None)
+    matrix: tuple[tuple[float, float, float], ...] = static_numbers("matrix", 3, 3)
+    offset: tuple[float, float, float] = static_numbers("offset", 3)
+    hue: float | None = static_numbers("hue", optional=True, default=None)
 
     def map_colors(self, color: Float[np.ndarray, "num 3"]) -> Float[np.ndarray, "num 3"]:
         """The colors at progress 1, float64."""
@@ -245,9 +229,9 @@ class Place(AbstractOverlay):
     **Source:** MiraGe, flat Gaussians in space; VeGaS eq:mirage.
     """
 
-    depth: float = _numbers("depth")
-    rotation: tuple[float, float, float] = _numbers("rotation", 3)
-    about: tuple[float, float] | None = _numbers("about", 2, optional=True)
+    depth: float = static_numbers("depth")
+    rotation: tuple[float, float, float] = static_numbers("rotation", 3)
+    about: tuple[float, float] | None = static_numbers("about", 2, optional=True)
 
     def __call__(self, gaussians, t, progress):
         gaussians = gaussians.in_space()
@@ -279,8 +263,8 @@ class TriangleFunction(AbstractOverlay):
     function: Callable[[Float[np.ndarray, "num 3 3"], float], Float[np.ndarray, "num 3 3"]] = eqx.field(static=True)
 
     def __call__(self, gaussians, t, progress):
-        flat, size = gaussians.in_space(), padded_size(len(gaussians))
-        vertices = np.asarray(_to_triangles(pad_rows(flat.mean, size), pad_rows(flat.factor, size)))[: len(flat)]
+        flat = gaussians.in_space()
+        vertices = call_padded(_to_triangles, flat.mean, flat.factor)
         moved = np.asarray(self.function(vertices.copy(), t))  # a copy: it may write to it
         require(
             moved.shape == vertices.shape and moved.dtype.kind in "fiu",
@@ -297,7 +281,7 @@ class TriangleFunction(AbstractOverlay):
         if np.array_equal(moved, vertices):
             return gaussians
         moved = vertices + progress * (moved - vertices)
-        mean, factor = (np.array(leaf)[: len(flat)] for leaf in _from_triangles(pad_rows(moved, size)))
+        mean, factor = call_padded(_from_triangles, moved)
         collinear = ~np.isfinite(factor).all((1, 2))
         require(
             not collinear.any(),
@@ -314,17 +298,18 @@ class TriangleFunction(AbstractOverlay):
 _MIN_PADDED_SIZE = 1024
 
 
-def padded_size(num: int) -> int:
-    """The number of rows that `num` rows are padded to: a power of two, so that compiled code is reused."""
-    return max(_MIN_PADDED_SIZE, 1 << (num - 1).bit_length())
+def call_padded(function: Callable[..., Any], *arrays: Float[np.ndarray, "num ..."]) -> Any:
+    """The rows that a compiled function makes of those of arrays, float32.
 
-
-def pad_rows(array: np.ndarray, size: int) -> Float[np.ndarray, "size ..."]:
-    """`array` with `size` rows, float32: padded by 0, or by unit matrices, which are valid factors and triangles."""
-    padded = np.empty((size, *array.shape[1:]), np.float32)
-    padded[: len(array)] = array
-    padded[len(array) :] = np.eye(*array.shape[1:]) if array.ndim == 3 else 0.0
-    return padded
+    Their number is padded to a power of two, so that compiled code is reused: by 0, or by unit matrices, which are
+    valid factors and triangles.
+    """
+    num = len(arrays[0])
+    size, padded = max(_MIN_PADDED_SIZE, 1 << (num - 1).bit_length()), []
+    for array in arrays:
+        fill = np.eye(*array.shape[1:]) if array.ndim == 3 else np.zeros(array.shape[1:])
+        padded.append(np.concatenate([array, np.broadcast_to(fill, (size - num, *fill.shape))], dtype=np.float32))
+    return jax.tree.map(lambda leaf: np.array(leaf)[:num], function(*padded))
 
 
 @jax.jit

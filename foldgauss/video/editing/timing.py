@@ -3,15 +3,15 @@
 import dataclasses
 import math
 from collections.abc import Callable
-from itertools import pairwise
 from numbers import Real
 from typing import Any, TypedDict
 
+import equinox as eqx
 import numpy as np
 from jaxtyping import Float, Float64
 
 from foldgauss._runtime.checks import check_one_of, is_within, require
-from foldgauss.video.editing.arguments import check_increasing, check_number, check_numbers
+from foldgauss.video.editing.arguments import check_increasing, check_number, static_numbers
 from foldgauss.video.selection.regions import check_times, resolve_frames
 
 CURVES = ("linear", "smooth")
@@ -34,8 +34,7 @@ class When(TypedDict, total=False):
     curve: str
 
 
-@dataclasses.dataclass(frozen=True)
-class Span:
+class Span(eqx.Module):
     """An interval of time in which an edit acts, and its `progress` there, from 0 to 1.
 
     The interval is `start` <= t < `stop`, None for no end. Inside, progress is 1, or it is interpolated between the
@@ -47,26 +46,20 @@ class Span:
     **Raises:** ValueError for an empty span, knots of different lengths or not increasing, and an unknown curve.
     """
 
-    start: float | None = None
-    stop: float | None = None
-    times: tuple[float, ...] = ()
-    values: tuple[float, ...] = ()
-    curve: str = "linear"
+    start: float | None = static_numbers("start", optional=True, default=None)
+    stop: float | None = static_numbers("stop", optional=True, default=None)
+    times: tuple[float, ...] = static_numbers("times", None, default=())
+    values: tuple[float, ...] = static_numbers("values", None, default=())
+    curve: str = eqx.field(static=True, default="linear")
 
-    def __post_init__(self) -> None:
+    def __check_init__(self) -> None:
         check_one_of("curve", self.curve, CURVES)
-        for name in ("start", "stop"):
-            value = getattr(self, name)
-            if value is not None:
-                object.__setattr__(self, name, check_number(name, value))
         require(
             None in (self.start, self.stop) or self.start < self.stop,
             "start, stop",
             expected="a start before the stop",
             got=f"{self.start}, {self.stop}",
         )
-        object.__setattr__(self, "times", check_numbers("times", self.times))
-        object.__setattr__(self, "values", check_numbers("values", self.values))
         require(
             len(self.times) == len(self.values) and all(is_within(value, "[0, 1]") for value in self.values),
             "values",
@@ -146,12 +139,8 @@ def make_span(
         return Span(start, stop, curve=curve)
     corners = {first, last, *(x for x in (begin + rise, end - fall) if first < x < last)}
     positions = np.array(sorted(corners | set(number[(number > first) & (number < last)].tolist())))
-    values = np.ones(len(positions))
-    if rise:
-        values = np.minimum(values, (positions - begin) / rise)
-    if fall:
-        values = np.minimum(values, (end - positions) / fall)
-    values = np.clip(values, 0.0, 1.0)
+    inward = [distance / length for distance, length in ((positions - begin, rise), (end - positions, fall)) if length]
+    values = np.clip(np.min(inward, axis=0), 0.0, 1.0)
     return Span(start, stop, *distinct_knots(np.interp(positions, number, knots), values), curve)
 
 
@@ -179,8 +168,7 @@ def distinct_knots(
 # ------------------------------------------------------------------------------------------------------ clocks
 
 
-@dataclasses.dataclass(frozen=True)
-class Clock:
+class Clock(eqx.Module):
     """An object's own time as a function of the video's time: linear between knots (t, own time).
 
     Before the first and after the last knot the own time is constant. Clocks may run backwards. At own times below 0
@@ -194,12 +182,10 @@ class Clock:
     **Raises:** ValueError for knots that are not finite, of different lengths or not increasing.
     """
 
-    times: tuple[float, ...]
-    own_times: tuple[float, ...]
+    times: tuple[float, ...] = static_numbers("times", None)
+    own_times: tuple[float, ...] = static_numbers("own_times", None)
 
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "times", check_numbers("times", self.times))
-        object.__setattr__(self, "own_times", check_numbers("own_times", self.own_times))
+    def __check_init__(self) -> None:
         require(
             self.times and len(self.times) == len(self.own_times),
             "times, own_times",
@@ -259,16 +245,24 @@ class TimeMap:
         """Whether both times are the same, to `_SAME`."""
         return bool(np.abs(self.own - self.whole).max() * max(len(self.own) - 1, 1) <= _SAME)
 
-    def to_own(self, t: float) -> float:
-        """The own time at a time of the whole; before the first frame and after the last, the time of that frame."""
-        return float(np.interp(t, self.whole, self.own))
+    @property
+    def to_own(self) -> Clock:
+        """Own times of times of the whole; before the first frame and after the last, the time of that frame."""
+        return Clock(*distinct_knots(self.whole, self.own))
+
+    @property
+    def to_whole(self) -> Clock:
+        """Times of the whole of own times."""
+        return Clock(*distinct_knots(self.own, self.whole))
 
     def convert_function(self, function: Callable[..., Any]) -> Callable[..., Any]:
         """A function whose last argument is a time of the whole, as a function of own time."""
 
+        to_whole = self.to_whole
+
         def converted(*arguments: Any) -> Any:
             *others, t = arguments
-            return function(*others, float(np.interp(t, self.own, self.whole)))
+            return function(*others, to_whole(t))
 
         return converted
 
@@ -284,19 +278,6 @@ class TimeMap:
         corners = np.unique(np.clip([first, last, *span.times, *self.whole], first, last))
         times, values = np.interp(corners, self.whole, self.own), np.interp(corners, span.times, span.values)
         return Span(start, stop, *distinct_knots(times, values), span.curve)
-
-    def convert_clock(self, clock: Clock) -> Clock:
-        """The clock from own time to own time, for a clock that shows frames of the segment only."""
-        first, last = self.whole[[0, -1]]
-        knots = sorted({*self.whole.tolist(), *(t for t in clock.times if first < t < last)})
-        corners = set(knots)
-        for one, other in pairwise(knots):  # the slope also changes where a frame is passed
-            begin, end = clock(one), clock(other)
-            low, high = sorted((begin, end))
-            passed = self.whole[(low < self.whole) & (self.whole < high)].tolist()
-            corners |= {one + (other - one) * (t - begin) / (end - begin) for t in passed}
-        times = np.array([(self.to_own(t), self.to_own(clock(t))) for t in sorted(corners)])
-        return Clock(*distinct_knots(*times.T))
 
     def check_clock(self, clock: Clock, span: Span | None, parameter: str, num_frames: int) -> None:
         """Raise ValueError if a clock, in the span where it acts, shows frames of other segments of the clip.

@@ -66,8 +66,12 @@ def without_paths(model: VideoModel, degree: int | None = None) -> tuple[VideoMo
         which = moved[start : start + CHUNK]
         u, weight, shift = _sample_places(arrays, frames, which)
         unit = np.abs(u * (weight > 0)).max(1)[:, None]  # of u, so that powers are of one size
+        powers = np.cumprod(np.broadcast_to((u / unit)[..., None], (*u.shape, highest)), -1)
+        weighted = powers.mT * (weight / weight.sum(1, keepdims=True))[:, None]
+        squares = (weight * (shift**2).sum(-1)).sum(1) / weight.sum(1)
         how = np.full((1, highest), RIDGE), lowest, NEEDED / pixels
-        coefficients[which], error[which] = fit_powers(u, unit, weight, shift, *how)
+        found, error[which] = fit_powers(weighted @ powers, weighted @ shift, squares, *how)
+        coefficients[which] = found / unit[..., None] ** np.arange(1, highest + 1)[:, None]
     used = max(lowest, int(((coefficients != 0).any(2) * np.arange(1, highest + 1)).max()))
     gaussians = splats.gaussians()
     log_scale, angle = find_axes(gaussians.scale_tril)
@@ -114,30 +118,27 @@ def _apply(maps: np.ndarray, place: np.ndarray) -> np.ndarray:
 
 
 def fit_powers(
-    u: Float[np.ndarray, "num times"],
-    unit: Float[np.ndarray, "num 1"],
-    weight: Float[np.ndarray, "num times"],
-    shift: Float[np.ndarray, "num times 2"],
+    normal: Float[np.ndarray, "num highest highest"],
+    right: Float[np.ndarray, "num highest 2"],
+    squares: Float[np.ndarray, " num"],
     ridges: Float[np.ndarray, "#num highest"],
     lowest: int,
     needed: float,
 ) -> tuple[Float[np.ndarray, "num highest 2"], Float[np.ndarray, " num"]]:
-    """Weighted least squares of `shift` by powers of u without a constant: coefficients, and root mean square errors.
+    """Weighted least squares of shifts by powers of u without a constant: coefficients, and root mean square errors.
 
     All use `lowest` powers, and those whose error is above `needed` as many more as reduce it, see `GAINED`; the other
-    coefficients are 0. `ridges` are those of the coefficients in powers of u / `unit`, relative to the sum of weights.
+    coefficients are 0. `normal`, `right` and `squares` are the weighted means of products of the powers, of powers with
+    the shifts, and of squared shifts; `ridges` are added to the diagonal.
     """
-    num, highest = len(u), ridges.shape[1]
-    powers = np.cumprod(np.broadcast_to((u / unit)[..., None], (*weight.shape, highest)), -1)
-    weight = weight / weight.sum(1, keepdims=True)
-    ridges = np.broadcast_to(ridges, (num, highest))[..., None] * np.eye(highest)
+    num, highest = right.shape[:2]
     coefficients, error = np.zeros((num, highest, 2)), np.full(num, np.inf)
     for used in range(lowest, highest + 1):
         off = np.flatnonzero(error > needed)
-        own, target = powers[off, :, :used], shift[off]
-        across = own.mT * weight[off, None]
-        found = np.linalg.solve(across @ own + ridges[off, :used, :used], across @ target)
-        left = np.sqrt((weight[off] * ((own @ found - target) ** 2).sum(-1)).sum(1))
+        own, target = normal[off, :used, :used], right[off, :used]
+        ridge = np.broadcast_to(ridges, (num, highest))[off, :used, None] * np.eye(used)
+        found = np.linalg.solve(own + ridge, target)
+        left = np.sqrt(np.maximum(squares[off] + (found * (own @ found - 2 * target)).sum((1, 2)), 0))
         better = left < GAINED * error[off]
         coefficients[off[better], :used], error[off[better]] = found[better], left[better]
-    return coefficients / unit[..., None] ** np.arange(1, highest + 1)[:, None], error
+    return coefficients, error

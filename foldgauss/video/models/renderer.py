@@ -30,13 +30,16 @@ _byte = nb.uint8
 
 
 class PreparedVideo:
-    """A video prepared for images of one size, by its `prepare(size)`; `times` are those of its frames."""
+    """A video prepared for images of one size, by its `prepare(size)`.
+
+    A subclass has `splats` and the `times` of its frames, or `weighted_splats`.
+    """
 
     times: Float[np.ndarray, " frames"]
 
     def splats(self, t: float) -> Splats2D:
-        """The splats of time t, front to back; NumPy leaves."""
-        raise NotImplementedError  # a base class: every kind of video has its own
+        """The splats of time t, front to back; NumPy leaves. In a fade they are those of the larger weight."""
+        return max(self.weighted_splats(t), key=lambda part: part[0])[1]
 
     def weighted_splats(self, t: float) -> list[tuple[float, Splats2D]]:
         """The splats of the images whose weighted sum is the frame at time t, with the weights, which sum to 1.
@@ -211,23 +214,17 @@ class VideoRenderer:
 
     def image(self, t: float) -> Float[np.ndarray, "channels height width"]:
         """The image at time t before rounding to 8 bits: planar float32, about [0, 1]."""
-        (first, splats), *others = self._prepared.weighted_splats(t)
-        image = self._render(splats)
-        if others:
-            image = np.float32(first) * image
-            for weight, splats in others:
-                image += np.float32(weight) * self._render(splats)
-        return image
+        first, *others = (self._render(*part) for part in self._prepared.weighted_splats(t))
+        return sum(others, start=first)
 
-    def _render(self, splats: Splats2D) -> Float[np.ndarray, "channels height width"]:
+    def _render(self, weight: float, splats: Splats2D) -> Float[np.ndarray, "channels height width"]:
         color = splats.color
         if len(self._background) > color.shape[-1]:
             color = np.pad(color, ((0, 0), (0, 1)), constant_values=1)  # alpha is the image of ones over zero
-        leaves = splats.mean, splats.factor, splats.opacity, color
-        model = self.model
-        return cpu.forward(
-            *leaves, self._background, self.size, compositing=model.compositing, options=model.options
-        ).image
+        leaves = splats.mean, splats.factor, splats.opacity, color, self._background
+        how = {"compositing": self.model.compositing, "options": self.model.options}
+        image = cpu.forward(*leaves, self.size, **how).image
+        return image if weight == 1 else np.float32(weight) * image
 
 
 def to_bytes(image: Float[np.ndarray, "channels height width"]) -> UInt8[np.ndarray, "height width channels"]:

@@ -15,6 +15,7 @@ from jaxtyping import Bool, Float16, Float32, Int, UInt8
 
 from foldgauss._runtime.kernels import kernel
 from foldgauss._runtime.threads import run_tasks
+from foldgauss.video.models.polynomial_folds import fit_powers
 
 #: Tracks have at most so many frames to either side.
 LONGEST = 36
@@ -469,11 +470,10 @@ def _gather(stack, index, scaled) -> np.ndarray:
 RIDGES = np.array([0.03, 0.12, 0.48])
 #: Width of the window in which a fold has to follow its track, in units of sigma_t: where the Gaussian is visible.
 WINDOW = 1.2
-#: A power is used only if the fold without it misses by more than this many pixels,
+#: A power is used only if the fold without it misses by more than this many pixels, see also `fit_powers`: beyond its
+#: track a cubic leaves the frame.
 NEEDED = 0.3
-#: and with it by less than this fraction of that: beyond its track a cubic leaves the frame.
-GAINED = 0.8
-CHUNK = 1024  # tracks per task
+CHUNK = 256  # tracks per task
 
 
 def fit_folds(
@@ -485,76 +485,25 @@ def fit_folds(
     from the track. Least squares without a constant, with as many powers as the track needs; those above the third
     are 0, since tracks do not determine them.
     """
-    coefficients, miss = _fit_powers(tracks, spread, degree, min(degree, 1))
-    for used in range(2, min(degree, 3) + 1):
-        off = np.flatnonzero(miss > NEEDED)
-        if not len(off):
-            break
-        bent, left = _fit_powers(tracks[off], spread[off], degree, used)
-        better = left < GAINED * miss[off]
-        coefficients[off[better]], miss[off[better]] = bent[better], left[better]
-    return coefficients, miss
-
-
-def _fit_powers(
-    tracks: Tracks, spread: Float32[np.ndarray, " num"], degree: int, used: int
-) -> tuple[Float32[np.ndarray, "num degree 2"], Float32[np.ndarray, " num"]]:
-    """`fit_folds` with the first `used` powers."""
-    num = len(spread)
+    (num, steps), highest = tracks.known.shape, min(degree, len(RIDGES))
     coefficients, miss = np.zeros((num, degree, 2), np.float32), np.empty(num, np.float32)
-    arguments = tracks.shift, tracks.known, WINDOW * np.asarray(spread, np.float64), RIDGES, used, coefficients, miss
-    run_tasks(lambda start: _fit(start, min(start + CHUNK, num), *arguments), range(0, num, CHUNK))
+    u = np.arange(steps // 2, -(steps // 2) - 1, -1.0)
+    orders, used = np.arange(2 * highest + 1), np.arange(1, highest + 1)
+    powers = u[:, None] ** orders  # all tracks have the same times, so sums over these are matrix products
+
+    def fit(start: int) -> None:
+        part = slice(start, start + CHUNK)
+        window = WINDOW * np.asarray(spread[part], np.float64)[:, None]
+        shift = np.moveaxis(tracks.shift[part], 2, 0).astype(np.float64, order="C")
+        unit = np.minimum(window, steps // 2) ** orders
+        weight = np.exp(-0.5 * u**2 / window**2) * tracks.known[part]
+        weighted, sums = weight * shift, weight @ powers / unit
+        total = sums[:, :1]
+        right = np.moveaxis(weighted @ powers[:, used] / unit[:, used] / total, 0, 2)
+        squares = np.einsum("cns,cns->n", weighted, shift) / total[:, 0]
+        normal = sums[:, used[:, None] + used] / total[..., None]
+        found, miss[part] = fit_powers(normal, right, squares, RIDGES[:highest] / total, min(degree, 1), NEEDED)
+        coefficients[part, :highest] = found / unit[:, used, None]
+
+    run_tasks(fit, range(0, num, CHUNK))
     return coefficients, miss
-
-
-@kernel
-def _fit(start, stop, shift, known, window, ridges, used, coefficients, miss):
-    """Weighted least squares of the tracks start..stop, by Cholesky's factor of the normal equations."""
-    longest = known.shape[1] // 2
-    powers, normal, factor = np.empty(used), np.empty((used, used)), np.empty((used, used))
-    right, fitted = np.empty((used, 2)), np.empty((used, 2))
-    for n in range(start, stop):
-        total, squares = 0.0, 0.0
-        normal[:], right[:] = 0.0, 0.0
-        unit = min(window[n], float(longest))  # of u, so that powers are of one size
-        for step in range(2 * longest + 1):
-            if not known[n, step]:
-                continue
-            u, weight = (longest - step) / unit, math.exp(-0.5 * ((longest - step) / window[n]) ** 2)
-            power = u
-            total += weight
-            for j in range(used):
-                powers[j] = power
-                power *= u
-            for c in range(2):
-                own = shift[n, step, c]
-                squares += weight * own * own
-                for j in range(used):
-                    right[j, c] += weight * own * powers[j]
-            for j in range(used):
-                for k in range(used):
-                    normal[j, k] += weight * powers[j] * powers[k]
-        for j in range(used):
-            for k in range(j + 1):
-                left = normal[j, k] + (ridges[j] if j == k else 0.0)
-                for m in range(k):
-                    left -= factor[j, m] * factor[k, m]
-                factor[j, k] = math.sqrt(left) if j == k else left / factor[k, k]
-        for c in range(2):
-            for j in range(used):
-                left = right[j, c]
-                for m in range(j):
-                    left -= factor[j, m] * fitted[m, c]
-                fitted[j, c] = left / factor[j, j]
-            for j in range(used - 1, -1, -1):
-                left = fitted[j, c]
-                for m in range(j + 1, used):
-                    left -= factor[m, j] * fitted[m, c]
-                fitted[j, c] = left / factor[j, j]
-            # sum w (s - p)^2 = sum w s^2 - 2 sum w s p + sum w p^2
-            for j in range(used):
-                for k in range(used):
-                    squares += fitted[j, c] * normal[j, k] * fitted[k, c]
-                squares -= 2 * fitted[j, c] * right[j, c]
-                coefficients[n, j, c] = fitted[j, c] / unit ** (j + 1)
-        miss[n] = math.sqrt(max(squares, 0.0) / total)

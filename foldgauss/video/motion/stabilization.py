@@ -145,14 +145,11 @@ class StabilizedVideo(FollowingVideo):
 
     def _position(self, t: float) -> tuple[int, float]:
         """The frame before t, and the fraction of the way to the next; between two shots, the nearer frame and 0."""
-        times = self.path.times
-        if len(times) == 1:
-            return 0, 0.0
-        k = int(np.clip(np.searchsorted(times, t, side="right") - 1, 0, len(times) - 2))
-        fraction = float(np.clip((t - times[k]) / max(times[k + 1] - times[k], 1e-30), 0, 1))
+        position = float(np.interp(t, self.path.times, np.arange(self.path.num_frames)))
+        k, fraction = int(position), position % 1
         if k + 1 in self.path.starts:
             return k + (fraction >= 0.5), 0.0  # half way the later one, as `snap_to_shots`
-        return (k + 1, 0.0) if fraction == 1 else (k, fraction)
+        return k, fraction
 
 
 class PreparedStabilizedVideo(PreparedVideo):
@@ -165,10 +162,6 @@ class PreparedStabilizedVideo(PreparedVideo):
         self._to_pixels = np.array([[scale, 0, width / 2], [0, scale, height / 2], [0, 0, 1]])
         self._to_model = np.linalg.inv(self._to_pixels)
         self._half = np.array([own_width, own_height]) / max(video.size) / 2
-
-    def splats(self, t: float) -> Splats2D:
-        """The splats of time t, front to back; NumPy leaves."""
-        return self._moved(self._prepared.splats(t), t)
 
     def weighted_splats(self, t: float) -> list[tuple[float, Splats2D]]:
         """See `PreparedVideo`."""

@@ -90,8 +90,7 @@ class CriteriaEvaluator:
         Raises `NothingMoves` if nothing moves in any of them.
         """
         positions = self._positions(**arguments) if function is by_time else None
-        is_range = isinstance(positions, range)
-        first, last = (positions[0], positions[-1]) if is_range else positions or (0, self.stand_in.num_frames)
+        first, last = positions or (0, self.stand_in.num_frames)
         parts, motionless = [], []
         for number, segment in enumerate(self.segments):
             if within is not None and not len(within[number]):
@@ -102,7 +101,7 @@ class CriteriaEvaluator:
                 one = self.replay(number)
                 if function is by_motion:
                     _LOG.info("Segment %d, whose first frame, 0, is frame %d of the clip:", number, segment.first)
-                own = arguments if positions is None else _own_arguments(positions, segment, one, arguments)
+                own = arguments if positions is None else _own_arguments(positions, segment, one, **arguments)
                 try:
                     parts.append(self.evaluate_segment(one, lambda model, _, own=own: function(model, **own)))
                 except NothingMoves as error:
@@ -113,21 +112,23 @@ class CriteriaEvaluator:
             raise motionless[0]
         return parts
 
-    def _positions(self, times: Any = None, frame: Any = None, frames: Any = None, alive: bool = False) -> Any:
-        """First and last frame position for `times`, else the range of frames."""
-        if times is None:
-            return resolve_frames(self.stand_in.num_frames, frame, frames)
-        return tuple(t * (self.stand_in.num_frames - 1) for t in check_times(times))
+    def _positions(
+        self, times: Any = None, frame: Any = None, frames: Any = None, alive: bool = False
+    ) -> tuple[float, float]:
+        """The first and the last frame position of the arguments of `by_time`."""
+        if times is not None:
+            return tuple(t * (self.stand_in.num_frames - 1) for t in check_times(times))
+        chosen, margin = resolve_frames(self.stand_in.num_frames, frame, frames), 0.0 if alive else 0.5
+        return chosen[0] - margin, chosen[-1] + margin
 
 
-def _own_arguments(positions: Any, segment: Segment, one: Edit, arguments: dict[str, Any]) -> dict[str, Any]:
-    """The arguments of `by_time` in a segment's own frames or times."""
-    if isinstance(positions, range):
-        first, stop = max(positions.start, segment.first), min(positions.stop, segment.stop)
-        return {**arguments, "frame": None, "frames": (first - segment.first, stop - segment.first)}
-    if one._time_map is None:
-        return arguments
-    return {**arguments, "times": tuple(map(one._time_map.to_own, arguments["times"]))}
+def _own_arguments(
+    positions: tuple[float, float], segment: Segment, one: Edit, *, alive: bool = False, **_: Any
+) -> dict[str, Any]:
+    """The arguments of `by_time` in a segment's own time; a single frame covers all times."""
+    knots = [-0.5, *range(segment.num_frames), segment.num_frames - 0.5]
+    own_times = np.interp(np.subtract(positions, segment.first), knots, [0, *frame_times_of(one._video), 1])
+    return {"times": own_times, "alive": alive}
 
 
 #: How the regions of criteria are made, and the argument that describes them.
@@ -151,13 +152,15 @@ class _RegionCriterion:
             make, name = _REGIONS[function]
             self._region = make(context.stand_in, self._options.pop(name), **where)
             self._frames = self._region.frames
+        #: By segment: the frames named that it has.
+        self._named = [[k for k in self._frames if one.first <= k < one.stop] for one in self._segments]
         #: By segment and layer: masks of what the neighbors show, by frames of the clip.
         self._masks: dict[int, list[dict[int, _Image]]] = {}
 
     def evaluate(self) -> list[Selection]:
         """The selection in each segment, breadth first from those that have the frames named."""
         numbers = range(len(self._segments))
-        named = [number for number in numbers if self._named_frames(number)]
+        named = [number for number in numbers if self._named[number]]
         waiting, reached, found = deque(named), set(named), {}
         while waiting:
             number = waiting.popleft()
@@ -173,14 +176,9 @@ class _RegionCriterion:
                     waiting.append(other)
         return [found[k] if k in found else self._context.select_none(k) for k in numbers]
 
-    def _named_frames(self, number: int) -> list[int]:
-        """The frames named that a segment has."""
-        segment = self._segments[number]
-        return [k for k in self._frames if segment.first <= k < segment.stop]
-
     def _evaluate_named(self, one: Edit, number: int) -> Selection:
         """In a segment that has some of the frames named."""
-        first, frames = self._segments[number].first, self._named_frames(number)
+        first, frames = self._segments[number].first, self._named[number]
         if self._function is by_click:
             options = self._options | {"frame": frames[0] - first}
             return self._context.evaluate_segment(one, lambda model, _: by_click(model, **options))

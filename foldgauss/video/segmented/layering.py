@@ -17,7 +17,7 @@ from foldgauss.video.editing.edited_video import (
     stack_layers,
 )
 from foldgauss.video.editing.overlays import AbstractOverlay, GaussianFunction, Retiming, TriangleFunction, is_active
-from foldgauss.video.editing.timing import NEVER, Clock, TimeMap, distinct_knots, frame_times_of
+from foldgauss.video.editing.timing import NEVER, TimeMap, frame_times_of
 from foldgauss.video.models.shared_paths import join_paths
 from foldgauss.video.models.splats import FoldedSplats
 from foldgauss.video.models.video_model import ONE_SEGMENT, VideoModel
@@ -115,8 +115,8 @@ def _convert(other: EditedVideo, time_map: TimeMap) -> EditedVideo:
 def _convert_layer(layer: Layer, time_map: TimeMap) -> Layer:
     layer = _drop_unseen(layer, time_map)
     overlays = (_convert_overlay(overlay, time_map) for overlay in layer.overlays)
-    clock = Clock(*distinct_knots(time_map.own, time_map.whole))
-    retiming = Retiming(np.ones(layer.num_gaussians, bool), None, clock)  # the last clock is applied first
+    # The last clock is applied first.
+    retiming = Retiming(np.ones(layer.num_gaussians, bool), None, time_map.to_whole)
     return Layer(layer.model, tuple(one for one in overlays if one is not None), (*layer.clocks, retiming))
 
 
@@ -209,16 +209,12 @@ def _concatenate(parts: list[FoldedSplats]) -> FoldedSplats:
     """The Gaussians of all parts; folds of a lower degree are padded with zero coefficients, see also `join_paths`."""
     degree = max(part.degree for part in parts)
 
-    def gather(name: str) -> list:
-        leaves = [jnp.asarray(getattr(part, name)) for part in parts]
-        if name == "coefficients":
-            return [jnp.pad(leaf, ((0, 0), (0, degree - leaf.shape[1]), (0, 0))) for leaf in leaves]
-        return leaves
+    def pad(part: FoldedSplats) -> FoldedSplats:
+        coefficients = jnp.pad(part.coefficients, ((0, 0), (0, degree - part.degree), (0, 0)))
+        return dataclasses.replace(part, coefficients=coefficients, envelope=None, path_index=None, paths=None)
 
     path_index, paths = join_paths(parts)
-    envelope = parts[0].envelope
-    if len(parts) > 1:  # it has the same values for all Gaussians, see `_check_alike`
-        envelope = jax.tree.map(lambda leaf: jnp.ravel(leaf)[0], envelope)
-    shared = {"envelope": envelope, "path_index": path_index, "paths": paths}
-    names = [field.name for field in dataclasses.fields(FoldedSplats) if field.name not in shared]
-    return FoldedSplats(**{name: jnp.concatenate(gather(name)) for name in names}, **shared)
+    # It has the same values for all Gaussians, see `_check_alike`.
+    envelope = jax.tree.map(lambda leaf: jnp.ravel(leaf)[0], parts[0].envelope)
+    joined = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *map(pad, parts))
+    return dataclasses.replace(joined, envelope=envelope, path_index=path_index, paths=paths)

@@ -14,7 +14,7 @@ from foldgauss._runtime.checks import is_integer, require, short_repr
 from foldgauss.render import RenderOptions, Splats2D
 from foldgauss.video.editing.edited_video import EditedVideo
 from foldgauss.video.models.frame_times import times_at
-from foldgauss.video.models.renderer import PreparedVideo, RenderedVideo
+from foldgauss.video.models.renderer import FollowingVideo, PreparedVideo
 from foldgauss.video.models.video_model import VideoModel
 
 #: Models that are kept prepared at once; as many as are visible, where more are (between the last frame of one fade and
@@ -92,7 +92,7 @@ class SegmentedTimes:
         return np.arange(self.num_frames) / max(self.num_frames - 1, 1)
 
 
-class SegmentedVideo(RenderedVideo):
+class SegmentedVideo(FollowingVideo):
     """The models of a clip's segments as one video; it is rendered, played and saved as a `VideoModel` is.
 
     Each segment keeps its own frame times and cuts: times between frames k and k + 1 of the clip are interpolated
@@ -114,11 +114,10 @@ class SegmentedVideo(RenderedVideo):
     def __init__(self, segments: Sequence[Segment]):
         self.segments = tuple(segments)
         _check_segments(self.segments)
-        lead = self.segments[0]
-        self.size: tuple[int, int] = tuple(lead.size)
-        self.fps: float = lead.fps
-        self.options: RenderOptions = lead.options
-        self.compositing: str = lead.compositing
+
+    @property
+    def _lead(self) -> Segment:
+        return self.segments[0]
 
     @classmethod
     def from_models(cls, parts: Sequence[tuple[int, VideoModel | EditedVideo]]) -> "SegmentedVideo":
@@ -214,10 +213,6 @@ class PreparedSegmentedVideo(PreparedVideo):
     def __init__(self, video: SegmentedVideo, size: tuple[int, int]):
         self._video, self._size = video, tuple(size)
         self._kept: OrderedDict[int, tuple[PreparedVideo, np.ndarray]] = OrderedDict()
-
-    def splats(self, t: float) -> Splats2D:
-        """The splats of time t of the segment with the largest weight; NumPy leaves."""
-        return max(self.weighted_splats(t), key=lambda part: part[0])[1]
 
     def weighted_splats(self, t: float) -> list[tuple[float, Splats2D]]:
         """The splats of the segments that are visible at time t, see `PreparedVideo`."""
