@@ -212,14 +212,15 @@ class VideoRenderer:
     def image(self, t: float) -> Float[np.ndarray, "channels height width"]:
         """The image at time t before rounding to 8 bits: planar float32, about [0, 1]."""
         (first, splats), *others = self._prepared.weighted_splats(t)
-        image = self._render(splats)
+        image = self.image_of(splats)
         if others:
             image = np.float32(first) * image
             for weight, splats in others:
-                image += np.float32(weight) * self._render(splats)
+                image += np.float32(weight) * self.image_of(splats)
         return image
 
-    def _render(self, splats: Splats2D) -> Float[np.ndarray, "channels height width"]:
+    def image_of(self, splats: Splats2D) -> Float[np.ndarray, "channels height width"]:
+        """The image of these splats, as `image`."""
         color = splats.color
         if len(self._background) > color.shape[-1]:
             color = np.pad(color, ((0, 0), (0, 1)), constant_values=1)  # alpha is the image of ones over zero
