@@ -15,6 +15,7 @@ from sklearn.exceptions import ConvergenceWarning
 from sklearn.mixture import GaussianMixture
 
 from benchmarks import _common
+from foldgauss import FoldedGaussian, FoldedMixture, PolynomialFold
 from foldgauss.estimator.folded_gaussian_mixture import FoldedGaussianMixture
 
 DIM = 3
@@ -23,26 +24,35 @@ ITERATIONS = 20
 DTYPES = (np.float32, np.float64)
 
 
-def make_problem(num: int, components: int) -> tuple[np.ndarray, dict[str, np.ndarray]]:
-    """Points from a mixture, and parameters near it as arguments of both estimators."""
+def make_problem(num: int, components: int) -> tuple[np.ndarray, FoldedMixture, dict[str, np.ndarray]]:
+    """Points from a mixture, and parameters near it as arguments of the two estimators."""
     rng = np.random.default_rng(_common.SEED)
     means = rng.normal(size=(components, DIM)) * 2
     factors = rng.normal(size=(components, DIM, DIM)) * 0.3 + 0.3 * np.eye(DIM)
     labels = rng.integers(0, components, num)
     x = means[labels] + np.einsum("nij,nj->ni", factors[labels], rng.normal(size=(num, DIM)))
     covariances = np.einsum("kij,klj->kil", factors, factors) + 0.1 * np.eye(DIM)
-    start = {"weights": np.full(components, 1 / components), "means": means + 0.1 * rng.normal(size=means.shape)}
-    start["precisions"] = np.linalg.inv(covariances)
-    return x, {f"{name}_init": values for name, values in start.items()}
+    weights, means = np.full(components, 1 / components), means + 0.1 * rng.normal(size=means.shape)
+    variance = covariances[:, -1, -1]
+    slope = covariances[:, :-1, -1] / variance[:, None]
+    parts = FoldedGaussian(
+        means[:, :-1],
+        covariance_matrix=covariances[:, :-1, :-1] - slope[:, :, None] * covariances[:, None, :-1, -1],
+        time_loc=means[:, -1],
+        time_scale=np.sqrt(variance),
+        fold=PolynomialFold(-slope[:, None]),
+    )
+    initial = {"weights_init": weights, "means_init": means, "precisions_init": np.linalg.inv(covariances)}
+    return x, FoldedMixture(parts, weights=weights), initial
 
 
 def time_fits(num: int, components: int, iterations: int, rounds: int) -> dict[str, float]:
     """Median seconds, by dtype, estimator and task, and the mean log-density that each fit reaches."""
-    x, start = make_problem(num, components)
+    x, start, initial = make_problem(num, components)
     stopping = {"max_iter": iterations, "tol": 0.0}
     makers = {
-        "foldgauss": lambda: FoldedGaussianMixture(components, degree=1, **stopping, **start),
-        "sklearn": lambda: GaussianMixture(components, **stopping, **start),
+        "foldgauss": lambda: FoldedGaussianMixture(components, degree=1, **stopping, start=start),
+        "sklearn": lambda: GaussianMixture(components, **stopping, **initial),
     }
     seconds, figures = {}, {}
     for round_ in range(-1, rounds):  # the first round compiles

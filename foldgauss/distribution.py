@@ -31,7 +31,7 @@ from foldgauss.analysis import moments
 from foldgauss.analysis.conditional import TimeMixture, conditional_gaussian, time_mixture
 from foldgauss.envelope import AbstractEnvelope, TimeLikelihood, as_envelope, check_peak
 from foldgauss.fold import AbstractFold, CallableFold, ZeroFold, as_fold, evaluate_shift, restrict_fold
-from foldgauss.gaussian import Gaussian, half_log_det, log_density, sample_components, unwhiten, whiten
+from foldgauss.gaussian import Gaussian, log_density, sample_components
 
 __all__ = ["FoldedGaussian", "Gaussian"]
 
@@ -180,40 +180,21 @@ class FoldedGaussian(AbstractDistribution):
     def _transform(self, noise: Float[Array, " d-1"], tau: Float[Array, ""]) -> Float[Array, " d"]:
         """Standard normal numbers as a sample, of one distribution."""
         t = self.time_loc + self.time_scale * tau
-        return jnp.append(unwhiten(self._at(t), noise), t)
+        return jnp.append(self._at(t)._transform(noise), t)
 
     def _sample_from(self, key: Key[Array, ""], sample_shape: tuple[int, ...], component: Array) -> Array:
         # One network in each of many samples would be copied for all.
         every = isinstance(self.fold, CallableFold)
         return super()._sample_from(key, sample_shape, component) if every else sample_components(self, key, component)
 
-    # --- whitening ------------------------------------------------------------------------------------------
+    def normal_to_fold(self, z: Float[Array, "*#batch d"]) -> Float[Array, "*#batch d"]:
+        """Transform standard normal points to points of the distribution.
 
-    def fold_to_normal(self, x: Float[Array, "*#batch d"]) -> tuple[Float[Array, "*#batch d"], Float[Array, "*#batch"]]:
-        """Whiten x: subtract the fold, then scale. Samples of the distribution become standard normal.
+            t = time_loc + time_scale z_d,   s = loc + f(time_loc - t) + sqrt(a(t)) L (z_1, ..., z_(d-1))
 
-            z = (L^-1 (s - loc - f(time_loc - t)) / sqrt(a(t)), (t - time_loc) / time_scale),   log |dz/dx|
+        **Shapes:** z (*sample, *batch, d) -> the same.
 
-        **Shapes:** x (*sample, *batch, d) -> the same and (*sample, *batch). **Units:** none.
-
-        **Example:** `z, log_det = dist.fold_to_normal(x)  # log_prob(x) = sum log N(z) + log_det`
-
-        **Source:** eq:transform_s. **Raises:** ValueError if the last dimension of x is not d.
-        """
-        return self._fold_to_normal(self._checked(x, "x"))
-
-    @compile_eager
-    @vectorized(1)
-    def _fold_to_normal(self, x: Array) -> tuple[Array, Array]:
-        at, tau = self._at(x[-1]), (x[-1] - self.time_loc) / self.time_scale
-        return jnp.append(whiten(at, x[:-1]), tau), -half_log_det(at) - jnp.log(self.time_scale)
-
-    def normal_to_fold(self, z: Float[Array, "*#batch d"]) -> tuple[Float[Array, "*#batch d"], Float[Array, "*#batch"]]:
-        """The inverse of `fold_to_normal`: x, and log |dx/dz|.
-
-        **Shapes:** z (*sample, *batch, d) -> the same and (*sample, *batch).
-
-        **Example:** `dist.normal_to_fold(jax.random.normal(key, (1000, 3)))[0]  # samples`
+        **Example:** `dist.normal_to_fold(jax.random.normal(key, (1000, 3)))  # samples`
 
         **Source:** eq:transform_s. **Raises:** ValueError if the last dimension of z is not d.
         """
@@ -221,9 +202,8 @@ class FoldedGaussian(AbstractDistribution):
 
     @compile_eager
     @vectorized(1)
-    def _normal_to_fold(self, z: Array) -> tuple[Array, Array]:
-        x = self._transform(z[:-1], z[-1])
-        return x, half_log_det(self._at(x[-1])) + jnp.log(self.time_scale)
+    def _normal_to_fold(self, z: Array) -> Array:
+        return self._transform(z[:-1], z[-1])
 
     # --- moments --------------------------------------------------------------------------------------------
 

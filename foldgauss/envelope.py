@@ -20,8 +20,16 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
-from foldgauss._numerics.batch import BatchModule, FunctionModule, concrete_value, divide, steepest, vectorize
-from foldgauss._runtime.checks import check_signature, invalid, require, short_repr
+from foldgauss._numerics.batch import (
+    BatchModule,
+    FunctionModule,
+    check_values,
+    common_dtype,
+    divide,
+    steepest,
+    vectorize,
+)
+from foldgauss._runtime.checks import check_signature, require, short_repr
 
 __all__ = ["AbstractEnvelope", "CallableEnvelope", "Constant", "TimeLikelihood", "as_envelope", "plain_envelope"]
 
@@ -93,21 +101,11 @@ class TimeLikelihood(AbstractEnvelope):
     is_closed = True
 
     def __init__(self, power: ArrayLike = 1.0, floor: ArrayLike = 0.0):
-        self.power, self.floor = _float_array(power), _float_array(floor)
-        require(
-            not _any(self.power, lambda x: ~((x >= 0) & (x < np.inf))),
-            "power",
-            expected="a finite number >= 0",
-            got=power,
-            cure="The paper's text has 1, its code 2.",
-        )
-        require(
-            not _any(self.floor, lambda x: ~((x >= 0) & (x < 1))),
-            "floor",
-            expected="a number in [0, 1)",
-            got=floor,
-            cure="For a = 1 use Constant().",
-        )
+        self.power, self.floor = (jnp.asarray(x, common_dtype(x)) for x in (power, floor))
+        cure = "The paper's text has 1, its code 2."
+        check_values("power", self.power, lambda x: (x >= 0) & (x < np.inf), "a finite number >= 0", cure)
+        cure = "For a = 1 use Constant()."
+        check_values("floor", self.floor, lambda x: (x >= 0) & (x < 1), "a number in [0, 1)", cure)
 
     def log_a(self, t, *, time_loc, time_scale):
         t, time_loc, time_scale, power, floor = jnp.broadcast_arrays(t, time_loc, time_scale, self.power, self.floor)
@@ -120,20 +118,17 @@ class TimeLikelihood(AbstractEnvelope):
 class CallableEnvelope(FunctionModule, AbstractEnvelope):
     """Any function that returns log a, with or without parameters, as an envelope.
 
-        log a(t) = log_a(t, time_loc, time_scale)
+        log a(t) = function(t, time_loc, time_scale)
 
-    **Shapes:** `log_a` maps three scalars to a scalar <= 0; this class vmaps it over batches. Arrays inside it (a
+    **Shapes:** `function` maps three scalars to a scalar <= 0; this class vmaps it over batches. Arrays inside it (a
     pytree) are leaves of the envelope and are trained with it.
 
     **Example:** `CallableEnvelope(lambda t, m, scale: -jnp.abs((t - m) / scale))  # a = exp(-|tau|)`
 
-    **Source:** the "suitably chosen" a of eq:cond_dens. **Raises:** ValueError if `log_a` is not callable.
+    **Source:** the "suitably chosen" a of eq:cond_dens. **Raises:** ValueError if `function` is not callable.
     """
 
-    def __init__(self, log_a: Callable[[Array, Array, Array], Array]):
-        if not callable(log_a):
-            raise invalid("log_a", expected="a callable (t, time_loc, time_scale) -> log a", got=repr(log_a))
-        super().__init__(log_a)
+    signature = "(t, time_loc, time_scale) -> log a"
 
     def log_a(self, t, *, time_loc, time_scale):
         dtype = jnp.result_type(t, time_loc, time_scale)
@@ -154,8 +149,7 @@ def plain_envelope(a: Callable[[Array, Array, Array], Array]) -> CallableEnvelop
 
     **Source:** a of eq:cond_dens. **Raises:** ValueError if `a` is not callable.
     """
-    if not callable(a):
-        raise invalid("a", expected="a callable (t, time_loc, time_scale) -> a in (0, 1]", got=repr(a))
+    require(callable(a), "a", expected="a callable (t, time_loc, time_scale) -> a in (0, 1]", got=repr(a))
     return CallableEnvelope(_Logarithm(a))
 
 
@@ -169,9 +163,13 @@ def as_envelope(envelope: AbstractEnvelope | Callable) -> AbstractEnvelope:
     """
     if isinstance(envelope, AbstractEnvelope):
         return envelope
-    if not callable(envelope):
-        cure = "Constant(), TimeLikelihood(power=...), a callable that returns log a, or plain_envelope(a)."
-        raise invalid("envelope", expected="an envelope or a callable", got=short_repr(envelope), cure=cure)
+    require(
+        callable(envelope),
+        "envelope",
+        expected="an envelope or a callable",
+        got=short_repr(envelope),
+        cure="Constant(), TimeLikelihood(power=...), a callable that returns log a, or plain_envelope(a).",
+    )
     check_signature("envelope", envelope, "t", "time_loc", "time_scale")
     return CallableEnvelope(envelope)
 
@@ -180,10 +178,9 @@ def check_peak(envelope: AbstractEnvelope, time_loc: ArrayLike, time_scale: Arra
     """Raise if log a > 0 at time_loc, as where a function returns a itself; traced values pass."""
     if envelope.is_closed:  # a built-in one
         return
-    peak = concrete_value(envelope.log_a(time_loc, time_loc=time_loc, time_scale=time_scale))
-    if peak is not None and (peak > _PEAK_ROUNDING).any():
-        cure = "For a function that returns a itself use plain_envelope(a)."
-        raise invalid("envelope", expected="log a <= 0 at time_loc", got=f"log a = {peak.max():g}", cure=cure)
+    peak = envelope.log_a(time_loc, time_loc=time_loc, time_scale=time_scale)
+    cure = "For a function that returns a itself use plain_envelope(a)."
+    check_values("envelope", peak, lambda log_a: ~(log_a > _PEAK_ROUNDING), "log a <= 0 at time_loc", cure)
 
 
 class _Logarithm(eqx.Module):
@@ -220,14 +217,3 @@ def _log_floored_jvp(primals, tangents):
     by_q = -jnp.exp(jnp.log1p(-floor) - q - log_a)
     by_floor = -jnp.expm1(-q) * jnp.exp(jnp.minimum(-log_a, math.log(steepest(q.dtype))))
     return log_a, by_q * q_dot + by_floor * floor_dot
-
-
-def _float_array(x: ArrayLike) -> Float[Array, "..."]:
-    x = jnp.asarray(x)
-    dtype = x.dtype if jnp.issubdtype(x.dtype, jnp.floating) else jnp.result_type(float)
-    return x.astype(dtype) if x.weak_type or x.dtype != dtype else x
-
-
-def _any(x: Array, wrong) -> bool:
-    """Whether a value is wrong; False under tracing, where values are not known."""
-    return not isinstance(x, jax.core.Tracer) and bool(np.any(wrong(np.asarray(x))))

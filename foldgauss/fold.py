@@ -22,6 +22,7 @@ from foldgauss._numerics.batch import (
     FunctionModule,
     check_finite,
     check_positive,
+    check_values,
     common_dtype,
     concrete_value,
     jvp_of_moving,
@@ -29,7 +30,7 @@ from foldgauss._numerics.batch import (
 )
 from foldgauss._numerics.piecewise import locate
 from foldgauss._numerics.triangular import join_columns, split_columns
-from foldgauss._runtime.checks import check_signature, invalid, is_integer, require, short_repr
+from foldgauss._runtime.checks import check_signature, is_integer, require, short_repr
 
 __all__ = [
     "AbstractFold",
@@ -245,11 +246,7 @@ class CallableFold(FunctionModule, AbstractFold):
     """
 
     shares_leaves = True
-
-    def __init__(self, function: Callable[[Float[Array, ""]], Float[Array, " d-1"]]):
-        if not callable(function):
-            raise invalid("function", expected="a callable u -> (d-1,)", got=repr(function))
-        super().__init__(function)
+    signature = "u -> (d-1,)"
 
     @vectorized(0)
     def __call__(self, u: Float[Array, "*#batch"]) -> Float[Array, "*#batch d-1"]:
@@ -310,17 +307,17 @@ class SharedPathFold(AbstractFold):
 
     def _check(self, space: tuple[int, ...]) -> None:
         dims = (*space, *(n + 1 for n in space))
-        if self.times.ndim < 2 or not dims or self.matrices.shape[-4:] != (*self.times.shape[-2:], *dims):
-            expected, got = "times (paths, knots) and matrices (paths, knots, d-1, d)", f"{self.times.shape}"
-            raise invalid("times, matrices", expected=expected, got=f"{got} and {self.matrices.shape}")
+        require(
+            self.times.ndim >= 2 and dims and self.matrices.shape[-4:] == (*self.times.shape[-2:], *dims),
+            "times, matrices",
+            expected="times (paths, knots) and matrices (paths, knots, d-1, d)",
+            got=f"{self.times.shape} and {self.matrices.shape}",
+        )
         for name in ("anchor", "time_loc", "times", "matrices"):
             check_finite(name, getattr(self, name))
-        times, index = concrete_value(self.times), concrete_value(self.index)
-        if times is not None and (np.diff(times) < 0).any():
-            raise invalid("times", expected="times that do not decrease", got=times.tolist())
+        check_values("times", self.times, lambda t: np.diff(t, prepend=-np.inf) >= 0, "times that do not decrease")
         most = self.times.shape[-2]
-        if index is not None and ((index < 0) | (index > most)).any():
-            raise invalid("index", expected=f"paths from 1 to {most}, or 0", got=index.tolist())
+        check_values("index", self.index, lambda k: (k >= 0) & (k <= most), f"paths from 1 to {most}, or 0")
 
     @property
     def is_closed(self) -> bool:
@@ -364,9 +361,13 @@ def as_fold(fold: AbstractFold | Callable) -> AbstractFold:
     """
     if isinstance(fold, AbstractFold):
         return fold
-    if not callable(fold):
-        cure = "For coefficients use PolynomialFold(coefficients)."
-        raise invalid("fold", expected="a fold or a callable u -> (d-1,)", got=short_repr(fold), cure=cure)
+    require(
+        callable(fold),
+        "fold",
+        expected="a fold or a callable u -> (d-1,)",
+        got=short_repr(fold),
+        cure="For coefficients use PolynomialFold(coefficients).",
+    )
     check_signature("fold", fold, "u")
     return CallableFold(fold)
 

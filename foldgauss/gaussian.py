@@ -170,7 +170,8 @@ class Gaussian(AbstractDistribution):
 
     def _transform(self, noise: Float[Array, " dim"]) -> Float[Array, " dim"]:
         """A standard normal point as a sample, of one Gaussian."""
-        return unwhiten(self, noise)
+        columns = multiply_lower(self.base_tril, split_columns(noise))
+        return self.loc + join_columns([times_exp(y, self.log_scale) for y in columns])
 
     def _sample_from(self, key: Key[Array, ""], sample_shape: tuple[int, ...], component: Array) -> Array:
         return sample_components(self, key, component)
@@ -246,18 +247,6 @@ def log_density(dist: Gaussian, value: Float[Array, " dim"]) -> Float[Array, ""]
     # Double where: 0 for the gradient of everything where the log-density is -inf.
     log_density = -jnp.where(unreachable, 0, half_square) - (half_log_det(dist) + 0.5 * value.size * _LOG_2PI)
     return jnp.where(unreachable, -jnp.inf, log_density)
-
-
-def whiten(dist: Gaussian, value: Float[Array, " dim"]) -> Float[Array, " dim"]:
-    """Standard normal coordinates of one point."""
-    y = join_columns(solve_lower(dist.base_tril, split_columns(value - dist.loc)))
-    return times_exp(y, -dist.log_scale)
-
-
-def unwhiten(dist: Gaussian, z: Float[Array, " dim"]) -> Float[Array, " dim"]:
-    """The inverse of `whiten`."""
-    columns = multiply_lower(dist.base_tril, split_columns(z))
-    return dist.loc + join_columns([times_exp(y, dist.log_scale) for y in columns])
 
 
 @jax.custom_jvp

@@ -38,7 +38,6 @@ from foldgauss.analysis.mixture_weights import (
 )
 from foldgauss.analysis.pair_densities import map_in_chunks, move_components_first, pair_log_prob
 from foldgauss.distribution import FoldedGaussian
-from foldgauss.gaussian import Gaussian
 
 __all__ = ["FoldedMixture", "Mixture"]
 
@@ -169,8 +168,6 @@ class Mixture(AbstractDistribution):
 
     def moments(self) -> tuple[Float[Array, "*batch d"], Float[Array, "*batch d d"]]:
         """E x = sum_k w_k E_k x, and Cov x = sum_k w_k (Cov_k x + (E_k x - E x)(E_k x - E x)^T)."""
-        if isinstance(self.components, Gaussian):  # one program for all
-            return _gaussian_moments(self)
         return _mixture_moments(self.weights, *self.components.moments())
 
     # --- conditional distributions ----------------------------------------------------------------------------
@@ -359,11 +356,6 @@ def _sample(mixture: Mixture, key, sample_shape: tuple[int, ...]):
     choice_key, key = jax.random.split(key)
     component = choose_components(choice_key, mixture.weights, (*sample_shape, *mixture.batch_shape))
     return mixture.components._sample_from(key, sample_shape, component), component
-
-
-@eqx.filter_jit
-def _gaussian_moments(mixture: Mixture) -> tuple[Array, Array]:
-    return mixture_moments(mixture.weights, *mixture.components.moments())
 
 
 _mixture_moments = jax.jit(mixture_moments)

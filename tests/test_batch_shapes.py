@@ -74,9 +74,7 @@ def _of_components(m, x):
     folded, x = m.components, x[..., None, :]
     t = x[..., 2]
     at, time = folded.condition_time(t), folded.marginal([-1])
-    z, log_det = folded.fold_to_normal(x)
-    found = [*_densities(folded, x), z, log_det]
-    found += [*folded.normal_to_fold(x), *_densities(folded.marginal([1, -1]), x[..., 1:])]
+    found = [*_densities(folded, x), folded.normal_to_fold(x), *_densities(folded.marginal([1, -1]), x[..., 1:])]
     found += [*_densities(at, x[..., :2]), *_moments(at), at.entropy(), *_moments(at.marginal(1))]
     return [*found, *_densities(time, x[..., 2:]), time.cdf(x[..., 2:]), time.icdf(jax.nn.sigmoid(t))]
 

@@ -195,11 +195,11 @@ def test_first_of_equal_runs_is_selected():
     assert loop.select_best([lost, lost]).log_likelihood == -np.inf
 
 
-def test_warm_start_continues_with_chunks():
+def test_a_fit_continues_with_chunks():
     x = _tracks()
-    begun = _fit(x, max_iter=2, warm_start=True)
+    begun = _fit(x, max_iter=2)
     reached = begun.lower_bound_
-    begun.set_params(max_iter=100).fit(np.split(x, CUTS))
+    begun.set_params(max_iter=100, start=begun.to_mixture()).fit(np.split(x, CUTS))
     assert begun.converged_
     assert begun.lower_bounds_[0] > reached
 

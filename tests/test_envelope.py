@@ -188,7 +188,7 @@ def test_plain_envelope_agrees_until_a_underflows_and_is_held_beyond(dtype, edge
 
 
 @pytest.mark.parametrize(
-    ("make", "name"), [(CallableEnvelope, "log_a"), (plain_envelope, "a"), (as_envelope, "envelope")]
+    ("make", "name"), [(CallableEnvelope, "function"), (plain_envelope, "a"), (as_envelope, "envelope")]
 )
 def test_what_is_not_callable_is_refused(make, name):
     with pytest.raises(ValueError, match=f"^{name}: expected .*, got "):

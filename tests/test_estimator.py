@@ -19,7 +19,8 @@ from sklearn.exceptions import ConvergenceWarning, NotFittedError
 from sklearn.mixture import GaussianMixture
 from sklearn.utils import estimator_checks
 
-from foldgauss.envelope import TimeLikelihood
+from foldgauss import FoldedGaussian, FoldedMixture, PolynomialFold
+from foldgauss.envelope import Constant, TimeLikelihood
 from foldgauss.estimator import EMStatus, FoldedGaussianMixture, FoldedMixtureRegressor
 from foldgauss.estimator.likelihood import fit
 from foldgauss.estimator.rows import warn_smooth
@@ -46,6 +47,18 @@ def _tracks(n=N, seed=0, noise=0.03):
     return np.stack([s, t], 1), labels
 
 
+def _start(means, precisions, weights=(1 / K,) * K, degree=1):
+    """Joint Gaussians, time last, as a mixture of Folded-Gaussians with linear folds."""
+    covariances = np.linalg.inv(precisions)
+    slope = covariances[:, :-1, -1] / covariances[:, -1:, -1]
+    within = covariances[:, :-1, :-1] - slope[:, :, None] * covariances[:, None, :-1, -1]
+    with jax.enable_x64(True):
+        parts = {"time_loc": means[:, -1], "time_scale": np.sqrt(covariances[:, -1, -1])}
+        fold = PolynomialFold(-slope[:, None][:, :degree])
+        components = FoldedGaussian(means[:, :-1], np.linalg.cholesky(within), **parts, fold=fold, envelope=Constant())
+        return FoldedMixture(components, weights=np.asarray(weights, float))
+
+
 def _same_partition(one, other) -> float:
     """Share of points on which two labelings agree, up to names."""
     table = np.array([[np.sum((one == i) & (other == j)) for j in range(K)] for i in range(K)])
@@ -57,7 +70,8 @@ def _same_partition(one, other) -> float:
 
 def test_an_initial_weight_may_be_0():
     """Without a warning of NumPy's, which is an error here; the component is reset."""
-    fitted = FoldedGaussianMixture(2, degree=1, weights_init=[1.0, 0.0], random_state=0).fit(_blobs())
+    start = _start(_blobs()[:2], np.tile(np.eye(3), (2, 1, 1)), [1.0, 0.0])
+    fitted = FoldedGaussianMixture(2, degree=1, start=start).fit(_blobs())
     assert (fitted.weights_ > 0).all()
 
 
@@ -67,18 +81,13 @@ def test_an_initial_weight_may_be_0():
 def test_linear_folds_match_scikit_learn(kind, degree, time):
     """A linear fold is a full covariance, no fold a diagonal one: the same start, the same iterations."""
     x = _blobs() + np.array([100.0, -5.0, 3.0])
-    precisions = {"full": np.tile(np.eye(3) * 0.1, (K, 1, 1)), "diag": np.full((K, 3), 0.1)}[kind]
-    same = {
-        "covariance_type": kind,
-        "reg_covar": 0,
-        "tol": 0,
-        "max_iter": 30,
-        "means_init": x[:K],
-        "weights_init": np.full(K, 1 / K),
-        "precisions_init": precisions,
-    }
-    theirs = GaussianMixture(K, **same).fit(x)
-    ours = FoldedGaussianMixture(K, degree=degree, reg_relative=0, time_column=time, **same).fit(x)
+    full = np.tile(np.eye(3) * 0.1, (K, 1, 1))
+    precisions = {"full": full, "diag": np.full((K, 3), 0.1)}[kind]
+    same = {"covariance_type": kind, "reg_covar": 0, "tol": 0, "max_iter": 30}
+    initial = {"means_init": x[:K], "weights_init": np.full(K, 1 / K), "precisions_init": precisions}
+    theirs = GaussianMixture(K, **same, **initial).fit(x)
+    start = _start(np.roll(x[:K], -1, 1) if time == 0 else x[:K], full, degree=degree)
+    ours = FoldedGaussianMixture(K, degree=degree, reg_relative=0, time_column=time, start=start, **same).fit(x)
     close = {"rtol": 1e-6, "atol": 1e-8}
     covariances = theirs.covariances_ if kind == "full" else theirs.covariances_[:, :, None] * np.eye(3)
     for name in ("weights_", "means_", *(("precisions_", "precisions_cholesky_") if kind == "full" else ())):
@@ -100,7 +109,7 @@ def test_linear_folds_match_scikit_learn(kind, degree, time):
     ],
 )
 def test_covariances_are_of_their_kind_and_precisions_their_inverses(kind, degree):
-    """Given means make a covariance for each component; those of a fit are of its kind all the same."""
+    """Each component of a start has its own covariance; those of a fit are of its kind all the same."""
     x, mixture = _blobs(), FoldedGaussianMixture(K, degree=degree, covariance_type=kind, time_column=1, random_state=0)
     fitted = mixture.fit(x)
     assert fitted.precisions_.shape == fitted.precisions_cholesky_.shape == (K, 3, 3)
@@ -117,7 +126,9 @@ def test_covariances_are_of_their_kind_and_precisions_their_inverses(kind, degre
     assert (fitted.predict_proba(x) * squares).sum(1).mean() == pytest.approx(fitted.weights_ @ sizes, rel=0.02)
     free = 3 * K - 1 + K * 2 * (1 + degree) + {"full": 3 * K, "tied": 3, "diag": 2 * K, "spherical": K}[kind]
     assert fitted.bic(x) == pytest.approx(-2 * N * fitted.score(x) + np.log(N) * free, rel=1e-12)
-    given = mixture.set_params(means_init=np.stack([x[k::K].mean(0) for k in range(K)])).fit(x).space_covariances_
+    means = np.stack([x[k::K].mean(0) for k in range(K)])[:, [0, 2, 1]]
+    start = _start(means, [np.linalg.inv(np.cov(x[k::K, [0, 2, 1]].T)) for k in range(K)], degree=min(degree, 1))
+    given = mixture.set_params(start=start).fit(x).space_covariances_
     is_tied, is_diagonal, is_round = (
         np.allclose(given, z, rtol=1e-9, atol=1e-12)
         for z in (given[:1], given * np.eye(2), given[:, :1, :1] * np.eye(2))
@@ -202,7 +213,7 @@ def test_annealing_ends_at_temperature_one():
     options = {"degree": 3, "random_state": 0}
     fitted = FoldedGaussianMixture(K, annealing=0.1, **options).fit(x)
     bound = fitted.lower_bound_
-    again = fitted.set_params(warm_start=True, annealing=1.0).fit(x)
+    again = fitted.set_params(start=fitted.to_mixture(), annealing=1.0).fit(x)
     assert abs(again.lower_bound_ - bound) < 1e-2
     cut = FoldedGaussianMixture(K, annealing=0.1, max_iter=10, **options).fit(x)
     assert cut.status_ == EMStatus.NOT_CONVERGED
@@ -301,12 +312,12 @@ def test_degenerate_data_give_finite_parameters():
         ("time_column", np.zeros((5, 3)), {"time_column": 3}),
         ("annealing", np.zeros((5, 3)), {"annealing": 0.0}),
         ("devices", np.zeros((5, 3)), {"devices": 1000}),
-        ("warm_start", np.zeros((5, 3)), {"warm_start": "yes"}),
+        ("start", _blobs(), {"start": "here"}),
+        ("start", _blobs(), {"start": _start(np.zeros((K, 2)), np.tile(np.eye(2), (K, 1, 1)))}),
+        ("start", _blobs(), {"n_components": 2, "start": _start(np.zeros((K, 3)), np.tile(np.eye(3), (K, 1, 1)))}),
+        ("start", _blobs(), {"degree": 0, "start": _start(np.zeros((1, 3)), np.eye(3)[None], [1.0])}),
         ("verbose", np.zeros((5, 3)), {"verbose": -1}),
         ("time_column", np.zeros((5, 3)), {"time_column": True}),
-        ("means_init", _blobs(), {"n_components": K, "means_init": np.zeros((2, 3))}),
-        ("means_init", _blobs(), {"n_components": K, "means_init": np.full((K, 3), np.nan)}),
-        ("precisions_init", _blobs(), {"n_components": K, "precisions_init": np.full((K, 3, 3), np.nan)}),
     ],
 )
 def test_invalid_arguments_raise(match, data, options):
@@ -364,16 +375,18 @@ def test_degrees_of_a_constant_column_and_of_exact_data():
 
 
 @pytest.mark.parametrize("chunked", [False, True])
-def test_warm_start_continues(chunked):
+def test_a_fit_continues_from_a_mixture(chunked):
     x = _blobs()
     rows, options = [x[:90], x[90:]] if chunked else x, {"degree": 1, "random_state": 0, "tol": 1e-4}
     whole = FoldedGaussianMixture(K, max_iter=200, **options).fit(x)
-    parts = FoldedGaussianMixture(K, max_iter=5, warm_start=True, **options)
+    parts = FoldedGaussianMixture(K, max_iter=5, **options)
     bounds = []
     for _ in range(40):
         bounds += parts.fit(rows).lower_bounds_
         if parts.converged_:
             break
+        with jax.enable_x64(True):
+            parts.set_params(start=parts.to_mixture())
     assert bounds == pytest.approx(whole.lower_bounds_, rel=1e-9)
     assert len(bounds) > 5  # it did need to go on
     cold = FoldedGaussianMixture(K, max_iter=5, **options).fit(x)
@@ -435,15 +448,6 @@ def test_times_too_coarse_for_float32_are_refused_or_counted_from_an_origin():
     with jax.enable_x64(True):
         assert far.to_mixture().components.loc.dtype == jnp.float64
     far.sample(3), far.condition(-1, 1e6)  # in the precision of the fit
-
-
-@pytest.mark.slow
-def test_warm_start_ignores_fits_of_other_sizes():
-    x = _blobs()
-    fitted = FoldedGaussianMixture(2, degree=1, warm_start=True, random_state=0).fit(x)
-    again = fitted.set_params(n_components=3, degree=2).fit(x)
-    assert again.means_.shape[0] == 3
-    assert again.fold_coefficients_.shape[1] == 2
 
 
 @pytest.mark.parametrize("name", ["iris", "wine"])
@@ -625,20 +629,10 @@ def test_samples_of_each_component_have_its_moments(kind):
 
 
 @pytest.mark.parametrize("kind", SOME_KINDS)
-def test_initial_values_are_checked_and_kept(kind):
-    shape = {"full": (K, 3, 3), "tied": (3, 3), "diag": (K, 3), "spherical": (K,)}[kind]
-    good = np.broadcast_to(np.eye(3), shape) if kind in ("full", "tied") else np.ones(shape)
-    bad = [
-        ("weights_init", np.full((K, 1), 1 / K)),
-        ("weights_init", np.full(K, 1.0)),
-        ("weights_init", [2, -0.5, -0.5]),
-    ]
-    bad += [("means_init", np.zeros((K + 1, 3))), ("precisions_init", -good), ("precisions_init", np.ones(7))]
-    for name, value in bad:
-        with pytest.raises(ValueError, match=name):
-            _fit(_clusters(), covariance_type=kind, **{name: value})
-    means = np.array([[0.0, 1, 2], [9, 1, 2], [0, 8, 7]])
-    start = _fit(_clusters(), covariance_type=kind, max_iter=0, means_init=means, weights_init=[0.5, 0.25, 0.25])
+def test_a_start_is_kept(kind):
+    means, weights = np.array([[0.0, 1, 2], [9, 1, 2], [0, 8, 7]]), [0.5, 0.25, 0.25]
+    given = _start(means, np.tile(np.eye(3), (K, 1, 1)), weights)
+    start = _fit(_clusters(), covariance_type=kind, max_iter=0, start=given)
     np.testing.assert_allclose(start.means_, means, atol=1e-12)
     np.testing.assert_allclose(start.weights_, [0.5, 0.25, 0.25])
     assert (start.n_iter_, start.converged_) == (0, False)
@@ -647,8 +641,8 @@ def test_initial_values_are_checked_and_kept(kind):
 def test_a_diverging_start_sets_all_attributes():
     """Precisions of 1e6 on a uniform cloud: most densities underflow."""
     x = np.random.default_rng(0).uniform(size=(30, 3))
-    options = {"covariance_type": "spherical", "means_init": x[:6], "precisions_init": np.logspace(6, 1, 6)}
-    fitted = _fit(x, 6, max_iter=1, reg_covar=0, reg_relative=0, **options)
+    start = _start(x[:6], np.logspace(6, 1, 6)[:, None, None] * np.eye(3), (1 / 6,) * 6)
+    fitted = _fit(x, 6, max_iter=1, reg_covar=0, reg_relative=0, covariance_type="spherical", start=start)
     assert not fitted.converged_
     for name in ("weights_", "means_", "covariances_", "n_iter_", "lower_bound_", "lower_bounds_"):
         assert np.isfinite(getattr(fitted, name)).all()

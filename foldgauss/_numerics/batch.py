@@ -4,7 +4,7 @@ import dataclasses
 import functools
 import math
 from collections.abc import Callable, Sequence
-from typing import TypeVar, get_args
+from typing import ClassVar, TypeVar, get_args
 
 import equinox as eqx
 import jax
@@ -35,9 +35,13 @@ class BatchModule(eqx.Module):
             if isinstance(value, eqx.Module):
                 ranks += value.leaf_ranks
             elif value is not None:
-                if rank is None:
-                    expected, got = 'annotated as Float[Array, "*batch ..."]', f"field {name} without its shape"
-                    raise invalid(type(self).__name__, expected=expected, got=got, cure="Or override leaf_ranks.")
+                require(
+                    rank is not None,
+                    type(self).__name__,
+                    expected='annotated as Float[Array, "*batch ..."]',
+                    got=f"field {name} without its shape",
+                    cure="Or override leaf_ranks.",
+                )
                 ranks.append(rank)
         return tuple(ranks)
 
@@ -62,7 +66,10 @@ class FunctionModule(BatchModule):
     # Set at construction, from the arrays of a single function, so that the axes of a later vmap are known to be batch.
     parameter_ranks: tuple[int, ...] = eqx.field(static=True)
 
+    signature: ClassVar[str]  # of the function, for errors
+
     def __init__(self, function: Callable):
+        require(callable(function), "function", expected=f"a callable {self.signature}", got=repr(function))
         self.parameters, self.static = eqx.partition(function, eqx.is_array)
         self.parameter_ranks = tuple(x.ndim for x in jax.tree.leaves(self.parameters))
 
@@ -217,26 +224,33 @@ def as_event(name: str, x: ArrayLike, dtype, event_shape: tuple[int, ...]) -> Ar
 def as_sample_shape(sample_shape: int | Sequence[int]) -> tuple[int, ...]:
     """The shape as a tuple; a whole number is that of one axis."""
     shape = sample_shape if isinstance(sample_shape, Sequence) else (sample_shape,)
-    if not all(is_integer(n, 0) for n in shape):
-        cure = "For n samples pass n or (n,)."
-        raise invalid("sample_shape", expected="whole numbers >= 0", got=short_repr(sample_shape), cure=cure)
+    require(
+        all(is_integer(n, 0) for n in shape),
+        "sample_shape",
+        expected="whole numbers >= 0",
+        got=short_repr(sample_shape),
+        cure="For n samples pass n or (n,).",
+    )
     return tuple(int(n) for n in shape)
+
+
+def check_values(name: str, x: Array, holds: Callable[[np.ndarray], np.ndarray], expected: str, cure: str = "") -> None:
+    """Raise with the first entry for which `holds` is false, unless the values are traced."""
+    value = concrete_value(x)
+    if value is not None and not (fine := holds(value)).all():
+        index = tuple(np.argwhere(~fine)[0].tolist())
+        raise invalid(name, expected=expected, got=f"{value[index]}{f' at index {index}' * bool(index)}", cure=cure)
 
 
 def check_finite(name: str, x: Array) -> None:
     """Raise if an entry is NaN or infinite, unless the values are traced."""
-    value = concrete_value(x)
-    if value is not None and not np.isfinite(value).all():
-        index = tuple(np.argwhere(~np.isfinite(value))[0].tolist())
-        raise invalid(name, expected="finite numbers", got=f"{value[index]} at index {index}")
+    check_values(name, x, np.isfinite, "finite numbers")
 
 
 def check_positive(name: str, x: Array, cure: str = "It is a standard deviation.") -> None:
     """Raise if an entry is not positive and finite, unless the values are traced."""
     check_finite(name, x)
-    value = concrete_value(x)
-    if value is not None and (value <= 0).any():
-        raise invalid(name, expected="positive numbers", got=f"a least of {value.min()}", cure=cure)
+    check_values(name, x, lambda value: value > 0, "positive numbers", cure)
 
 
 # --- searching ------------------------------------------------------------------------------------------------

@@ -5,14 +5,21 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, ArrayLike, Float
 
-from foldgauss._numerics.batch import check_finite, check_positive, concrete_value
-from foldgauss._runtime.checks import invalid, require
+from foldgauss._numerics.batch import check_finite, check_positive, check_values, concrete_value
+from foldgauss._runtime.checks import is_integer, require
 
 
 def resolve_scale_tril(given: dict[str, ArrayLike | None], *, dim: int, dtype, validate: bool) -> Array:
     """The lower-triangular factor L of Sigma = L L^T, from the one matrix (or scales) that is given."""
-    name, matrix = _the_one_given(given)
-    matrix = jnp.asarray(matrix, dtype)
+    names = [name for name, x in given.items() if x is not None]
+    require(
+        len(names) == 1,
+        ", ".join(given),
+        expected="exactly one of them",
+        got=" and ".join(names) or "none",
+        cure="Sigma is one matrix, given one way.",
+    )
+    name, matrix = names[0], jnp.asarray(given[names[0]], dtype)
     if name == "scale":
         return _diagonal(matrix, dim, validate)
     check_matrix(name, matrix, dim)
@@ -26,15 +33,6 @@ def resolve_scale_tril(given: dict[str, ArrayLike | None], *, dim: int, dtype, v
     upper = check_and_factorize(name, matrix[..., ::-1, ::-1], validate)[..., ::-1, ::-1]
     identity = jnp.broadcast_to(jnp.eye(dim, dtype=dtype), matrix.shape)
     return jnp.tril(lax.linalg.triangular_solve(jnp.swapaxes(upper, -1, -2), identity, left_side=True, lower=True))
-
-
-def _the_one_given(given: dict[str, ArrayLike | None]) -> tuple[str, ArrayLike]:
-    present = [(name, x) for name, x in given.items() if x is not None]
-    if len(present) != 1:
-        names = ", ".join(given)
-        got = " and ".join(name for name, _ in present) or "none"
-        raise invalid(names, expected="exactly one of them", got=got, cure="Sigma is one matrix, given one way.")
-    return present[0]
 
 
 def check_loc(loc: Array) -> None:
@@ -73,21 +71,10 @@ def _diagonal(scale: Array, dim: int, validate: bool) -> Array:
 
 def check_tril(tril: Array) -> None:
     check_finite("scale_tril", tril)
-    tril = concrete_value(tril)
-    if tril is None:
-        return
-    require(
-        (np.triu(tril, 1) == 0).all(),
-        "scale_tril",
-        expected="lower-triangular matrices",
-        got="entries above the diagonal",
-        cure="Take jnp.tril of it, or pass covariance_matrix.",
-    )
-    diagonal = np.diagonal(tril, axis1=-2, axis2=-1)
-    if (diagonal <= 0).any():
-        cure = "Flip the sign of its column: Sigma stays the same."
-        got = f"a least entry of {diagonal.min()}"
-        raise invalid("scale_tril", expected="a positive diagonal", got=got, cure=cure)
+    cure = "Take jnp.tril of it, or pass covariance_matrix."
+    check_values("scale_tril", tril, lambda x: np.triu(x, 1) == 0, "lower-triangular matrices", cure)
+    cure = "Flip the sign of its column: Sigma stays the same."
+    check_values("scale_tril", tril, lambda x: (x > 0) | ~np.eye(x.shape[-1], dtype=bool), "a positive diagonal", cure)
 
 
 def check_and_factorize(name: str, covariance: Array, validate: bool) -> Array:
@@ -127,26 +114,22 @@ def marginal_tril(tril: Float[Array, "*batch dim dim"], indices: tuple[int, ...]
 def normalize_indices(indices, dim: int) -> tuple[int, ...]:
     """Coordinates counted from 0, each once, from any integers (negative ones count from the end)."""
     cure = f"The coordinates are 0 to {dim - 1}, time is {dim - 1} (or -1)."
-    try:
-        given = np.atleast_1d(np.asarray(indices))
-        given = [int(i) for i in given if i == int(i)] if given.dtype != bool else None  # a mask is not indices
-    except (TypeError, ValueError, OverflowError):
-        given = None
+    given = np.atleast_1d(np.asarray(indices, object)).tolist()
     require(
-        given and len(given) == np.size(indices),
+        given and all(is_integer(i, -np.inf) for i in given),  # a mask is not indices
         "indices",
         expected="whole numbers, at least one",
         got=repr(indices),
         cure=cure,
     )
     require(
-        not any(not -dim <= i < dim for i in given),
+        all(-dim <= i < dim for i in given),
         "indices",
         expected=f"numbers from {-dim} to {dim - 1}",
         got=repr(indices),
         cure=cure,
     )
-    result = tuple(i % dim for i in given)
+    result = tuple(int(i) % dim for i in given)
     require(len(set(result)) == len(result), "indices", expected="each coordinate once", got=repr(indices), cure=cure)
     return result
 

@@ -79,3 +79,46 @@ def _solve_large(tril: Matrix, b: Vector, *, transpose: bool) -> Vector:
     batch = jnp.broadcast_shapes(tril.shape[:-2], b.shape[:-1])
     tril, b = jnp.broadcast_to(tril, (*batch, dim, dim)), jnp.broadcast_to(b, (*batch, dim))
     return solve(tril, b[..., None])[..., 0]
+
+
+# --- batches of small matrices, by products only (see `solve_upper_matrix` on jaxlib's own solver) ------------------
+
+
+def cholesky(matrix: Matrix) -> Matrix:
+    """L with L L' = matrix, column by column; NaN where a pivot is not positive."""
+    dim = matrix.shape[-1]
+
+    def column(j, tril):
+        rest = matrix[..., :, j] - jnp.einsum("...ab,...b->...a", tril, tril[..., j, :])
+        pivot = rest[..., j]
+        root = jnp.sqrt(jnp.where(pivot > 0, pivot, jnp.nan))
+        below = jnp.where(jnp.arange(dim) >= j, 1, 0).astype(matrix.dtype)
+        return tril.at[..., :, j].set(rest * below.reshape((1,) * (rest.ndim - 1) + (dim,)) / root[..., None])
+
+    return _each_column(column, jnp.zeros_like(matrix))
+
+
+def inverse_lower(tril: Matrix) -> Matrix:
+    """L^-1, row by row."""
+    eye = jnp.eye(tril.shape[-1], dtype=tril.dtype)
+
+    def row(i, inverse):
+        new = -jnp.einsum("...b,...bc->...c", tril[..., i, :], inverse)
+        new = new + jnp.broadcast_to(eye[i], new.shape)
+        return inverse.at[..., i, :].set(new / tril[..., i, i, None])
+
+    return _each_column(row, jnp.zeros_like(tril))
+
+
+def log_det(tril: Matrix) -> Float[Array, "*#batch"]:
+    """log |L L'|."""
+    return 2 * jnp.log(jnp.diagonal(tril, axis1=-2, axis2=-1)).sum(-1)
+
+
+def _each_column(body, start):
+    dim = start.shape[-1]
+    if dim > UNROLLED_SIZE:
+        return lax.fori_loop(0, dim, body, start)
+    for j in range(dim):
+        start = body(j, start)
+    return start

@@ -30,8 +30,7 @@ def invalid(parameter: str, *, expected: str, got: object, cure: str = "", kind:
 
 def check_one_of(parameter: str, value: object, choices: tuple[str, ...]) -> None:
     """Raise unless `value` is one of `choices`; an unknown option never falls through to a default."""
-    if value not in choices:
-        raise invalid(parameter, expected="one of " + ", ".join(map(repr, choices)), got=short_repr(value))
+    require(value in choices, parameter, expected="one of " + ", ".join(map(repr, choices)), got=short_repr(value))
 
 
 def short_repr(value: object) -> str:
@@ -52,8 +51,7 @@ def is_within(value: object, bounds: str) -> bool:
 
 def check_within(parameter: str, value: object, bounds: str, expected: str) -> None:
     """Raise unless `is_within(value, bounds)`; `expected` describes what is."""
-    if not is_within(value, bounds):
-        raise invalid(parameter, expected=expected, got=repr(value))
+    require(is_within(value, bounds), parameter, expected=expected, got=repr(value))
 
 
 def _is_finite(value: Real) -> bool:

@@ -134,7 +134,6 @@ def _checked_value(name: str, value: Any, kind: type, valid: Setting) -> Any:
         return float(value)
     if kind is str:
         check_one_of(name, value, valid.choices)
-    elif not isinstance(value, kind):
-        article = "an" if kind.__name__[0] in "AEIOU" else "a"
-        raise invalid(name, expected=f"{article} {kind.__name__}", got=repr(value))
+    article = "an" if kind.__name__[0] in "AEIOU" else "a"
+    require(isinstance(value, kind), name, expected=f"{article} {kind.__name__}", got=repr(value))
     return value

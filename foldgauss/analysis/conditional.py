@@ -84,7 +84,7 @@ class TimeMixture(AbstractDistribution):
         return (self._space_dim + int(self.keeps_time),)
 
     def _log_prob(self, value: Array) -> Array:
-        joint = self.parent.log_prob(self._join(value)) if self.keeps_time else self._integrate(value)[0]
+        joint = self.parent.log_prob(_append(self.values, value)) if self.keeps_time else self._integrate(value)[0]
         return self._given(joint)
 
     def error_estimate(self, x: Float[Array, "*#batch n"]) -> Float[Array, "*#batch"]:
@@ -111,7 +111,7 @@ class TimeMixture(AbstractDistribution):
         if self.keeps_time:
             return _time_cdf(self.time.panels, value[..., 0], self.parent.time_loc, self.parent.time_scale)
         near = jnp.where(jnp.isinf(value), 0, value)
-        log_mass = self._given(map_over_batch(_log_space_cdf, self.parent, (self._join(near), 1)))
+        log_mass = self._given(map_over_batch(_log_space_cdf, self.parent, (_append(self.values, near), 1)))
 
         def bound(value, log_mass):
             mass = jnp.clip(jnp.exp(log_mass), 0, 1)
@@ -178,7 +178,7 @@ class TimeMixture(AbstractDistribution):
     def condition(self, indices, values) -> "TimeMixture | Gaussian":
         """The other coordinates, given these: exact, a Gaussian, if time is among the given."""
         indices, num_given = normalize_indices(indices, self.event_shape[0]), self.values.shape[-1]
-        both = self._join(as_event("values", values, self.dtype, (len(indices),)))
+        both = _append(self.values, as_event("values", values, self.dtype, (len(indices),)))
         given = (*range(num_given), *(num_given + i for i in indices))
         if self.keeps_time:
             return self.parent.condition(given, both)
@@ -196,17 +196,13 @@ class TimeMixture(AbstractDistribution):
     def _space_dim(self) -> int:
         return self.parent.event_shape[0] - 1 - self.values.shape[-1]
 
-    def _join(self, x: Array) -> Array:
-        """The values that are given, then x."""
-        return _append(self.values, x)
-
     def _integrate(self, x: Array) -> tuple[Array, Array]:
         """log of the joint density of x and the values, and its estimated error."""
-        return map_over_batch(_log_space_density, self.parent, (self._join(x), 1))
+        return map_over_batch(_log_space_density, self.parent, (_append(self.values, x), 1))
 
     def _given(self, log_joint: Array) -> Array:
         """The logarithm of the joint density divided by the density of the values."""
-        return log_joint if self.time is None else _divide_all(log_joint, self.time.log_normalizer)
+        return log_joint if self.time is None else _divide(log_joint, self.time.log_normalizer)
 
 
 def time_mixture(parent, kept, given, values, *, keeps_time: bool) -> TimeMixture:
@@ -239,20 +235,17 @@ def _time_icdf(panels: Panels, q, time_loc, time_scale) -> Array:
 
 @compile_eager
 def _append(values: Array, x: Array) -> Array:
+    """The values that are given, then x."""
     return vectorize(jnp.append, (values, 1), (x, 1))
 
 
 @compile_eager
-def _divide_all(log_joint: Array, log_given: Array) -> Array:
-    return vectorize(_divide, log_joint, log_given)
+def _divide(log_joint: Array, log_given: Array) -> Array:
+    return vectorize(lambda a, b: jnp.where(jnp.isneginf(a), -jnp.inf, a - b), log_joint, log_given)
 
 
 def _over(x: Array, batch: tuple[int, ...]) -> Array:
     return jnp.broadcast_to(x, (*batch, x.shape[-1]))
-
-
-def _divide(log_joint: Array, log_given: Array) -> Array:
-    return jnp.where(jnp.isneginf(log_joint), -jnp.inf, log_joint - log_given)
 
 
 # --- one at a time: parents and values without batch --------------------------------------------------------

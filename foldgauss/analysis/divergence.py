@@ -7,7 +7,7 @@ from jax import lax
 from jaxtyping import Array, Float
 
 from foldgauss._numerics.batch import broadcast_leaves, compile_eager, concrete_value, map_over_batch
-from foldgauss._runtime.checks import invalid
+from foldgauss._runtime.checks import require
 from foldgauss.analysis.moments import mean_log_envelope
 from foldgauss.analysis.quadrature import (
     HALF_LOG_2PI,
@@ -54,40 +54,33 @@ def kl_divergence(p, q, *, with_error: bool = False) -> Array | tuple[Array, Arr
     if isinstance(p, Gaussian):
         value, error = _kl_gaussian(p, q), 0
     else:
-        value, error = _kl_folded(*_from_time_zero(p, q))
+        p, q = _from_time_zero(p, q)
+        value, error = _chain_rule(p, q, *_expectations(p, q))
     error = lax.stop_gradient(jnp.broadcast_to(jnp.asarray(error, value.dtype), value.shape))
     warn_of_error("kl_divergence", jnp.where(jnp.isinf(value), 0, error / jnp.maximum(1, jnp.abs(value))))
     return (value, error) if with_error else value
 
 
-def _kl_folded(p, q):
-    """The divergence and its estimated error."""
-    found, errors = _expectations(p, q)
-    return _chain_rule(p.marginal([-1]), q.marginal([-1]), p.scale_tril, q.scale_tril, found, errors)
-
-
 @compile_eager
-def _chain_rule(time_p: Gaussian, time_q: Gaussian, tril_p, tril_q, found, errors):
+def _chain_rule(p, q, found, errors):
     """Return the divergence and its estimated error. `found` are expectations over time, with `errors`."""
-    dim, (ratio, mahalanobis, log_ratio) = tril_p.shape[-1], found
-    trace, log_det = _trace_and_log_det(tril_p, tril_q)
+    dim, (ratio, mahalanobis, log_ratio) = p.loc.shape[-1], found
+    trace, log_det = _trace_and_log_det(p.scale_tril, q.scale_tril)
     space = 0.5 * (trace * ratio - dim + log_det + dim * log_ratio + mahalanobis)
     error = 0.5 * (trace * errors[0] + errors[1] + dim * errors[2])
-    return _kl_gaussian(time_p, time_q) + space, error
+    return _kl_gaussian(p.marginal([-1]), q.marginal([-1])) + space, error
 
 
 def _check_pair(p, q) -> None:
-    same = (isinstance(p, Gaussian) and isinstance(q, Gaussian)) or (_is_folded(p) and _is_folded(q))
-    if same and p.event_shape == q.event_shape:
-        return
-    got = " and ".join(f"{type(x).__name__} of {getattr(x, 'event_shape', 'no')} coordinates" for x in (p, q))
-    cure = "Across classes, estimate it: the mean of p.log_prob - q.log_prob over samples of p."
-    raise invalid("p, q", expected="two distributions of one class and dimension", got=got, cure=cure)
-
-
-def _is_folded(dist) -> bool:
-    """Whether it has the parts of a `FoldedGaussian`, which is built upon this module's package."""
-    return all(hasattr(dist, name) for name in ("time_loc", "time_scale", "fold", "envelope"))
+    # A `FoldedGaussian`, which is built upon this module's package, has an envelope.
+    same = all(isinstance(x, Gaussian) for x in (p, q)) or all(hasattr(x, "envelope") for x in (p, q))
+    require(
+        same and p.event_shape == q.event_shape,
+        "p, q",
+        expected="two distributions of one class and dimension",
+        got=" and ".join(f"{type(x).__name__} of {getattr(x, 'event_shape', 'no')} coordinates" for x in (p, q)),
+        cure="Across classes, estimate it: the mean of p.log_prob - q.log_prob over samples of p.",
+    )
 
 
 def _from_time_zero(p, q):

@@ -10,8 +10,8 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, ArrayLike
 
-from foldgauss._numerics.batch import align, broadcast_leaves, check_batch, concrete_value, ranked_leaves
-from foldgauss._runtime.checks import invalid, require
+from foldgauss._numerics.batch import align, broadcast_leaves, check_batch, check_values, ranked_leaves
+from foldgauss._runtime.checks import require
 
 
 def broadcast_weights(components, logits: ArrayLike | None, weights: ArrayLike | None, validate: bool):
@@ -42,26 +42,14 @@ def broadcast_weights(components, logits: ArrayLike | None, weights: ArrayLike |
 
 
 def _check_weights(name: str, given: Array) -> None:
-    given = concrete_value(given)
-    if given is None:
-        return
-    least = 0 if name == "weights" else -np.inf
-    if not ((given >= least) & (given < np.inf)).all():
-        expected = "finite values >= 0" if name == "weights" else "values below infinity"
-        cure = "A component without weight has weight 0, or a logit of -inf."
-        raise invalid(name, expected=expected, got=given.tolist(), cure=cure)
-    require(
-        (given > least).any(-1).all(),
-        name,
-        expected="a positive weight",
-        got="none",
-        cure="Weights are relative: all equal means 1/k.",
-    )
+    least, expected = (0, "finite values >= 0") if name == "weights" else (-np.inf, "values below infinity")
+    cure = "A component without weight has weight 0, or a logit of -inf."
+    check_values(name, given, lambda x: (x >= least) & (x < np.inf), expected, cure)
     # JAX computes with those below as with 0; with float16 and bfloat16 it computes in float32.
     normal = float(min(jnp.finfo(given.dtype).tiny, jnp.finfo(jnp.float32).tiny))
-    if name == "weights" and not (given >= normal).any(-1).all():
-        cure = "Weights are relative: divide by the largest."
-        raise invalid(name, expected=f"a weight of at least {normal:g}", got=given.tolist(), cure=cure)
+    cure = "Weights are relative: divide by the largest; all equal means 1/k."
+    present = lambda x: (x >= normal if name == "weights" else x > least).any(-1)  # noqa: E731
+    check_values(name, given, present, f"a positive weight, of at least {normal:g}", cure)
 
 
 def _log_weights(weights: Array) -> Array:

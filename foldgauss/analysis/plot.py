@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+import scipy.ndimage
 
 from foldgauss._runtime.checks import require
 from foldgauss._runtime.optional_imports import import_optional
@@ -83,10 +84,11 @@ def plot_history(history: Sequence[Any], axes: "np.ndarray | None" = None) -> np
         )[1]
     drawn = history[:: max(len(history) // _STEPS_DRAWN, 1)]
     steps, seconds, loss, psnr = np.array([(i.step, i.seconds, i.loss, i.psnr) for i in drawn], float).T
+    median = scipy.ndimage.median_filter(loss, 2 * max(len(loss) // 100, 1) + 1, mode="nearest")
     for x, name, (upper, lower) in ((seconds, "seconds", axes[:, 0]), (steps, "steps", axes[:, 1])):
         upper.plot(x, psnr, "o" if len(x) == 1 else "-", color=_BLUE, linewidth=1.6)
         lower.plot(x, loss, "o" if len(x) == 1 else "-", color=_RED, linewidth=0.6, alpha=0.3, label="each step")
-        lower.plot(x, _running_median(loss), color=_RED, linewidth=1.6, label="running median")
+        lower.plot(x, median, color=_RED, linewidth=1.6, label="running median")
         lower.set(xlabel=name, yscale="log" if (loss > 0).any() else "linear")  # 0 throughout for a black clip
         lower.set_xlim(left=0)  # initialization takes time too
         for ax in (upper, lower):
@@ -181,15 +183,6 @@ def _name_points(ax, panel: Panel, quality: np.ndarray, names: Sequence[str]) ->
             note.remove()
         else:
             taken.append(note.get_window_extent())
-
-
-def _running_median(values: np.ndarray) -> np.ndarray:
-    """The median of a window of 2% of the values around each; shorter at the ends."""
-    reach = max(len(values) // 100, 1)
-    padded = np.pad(values, reach, constant_values=np.nan)
-    windows = np.lib.stride_tricks.sliding_window_view(padded, 2 * reach + 1)
-    known = (window[~np.isnan(window)] for window in windows)
-    return np.array([np.median(window) if window.size else np.nan for window in known])
 
 
 def _draw_density(dist, ax, t_limits, s_limits) -> None:

@@ -25,16 +25,16 @@ from foldgauss.estimator.em.initialization import INITIALIZERS, draw_subset, ini
 from foldgauss.estimator.em.loop import EMStatus, Run, run_em, select_best
 from foldgauss.estimator.em.m_step import Model
 from foldgauss.estimator.em.prune import count_parameters, drop_unused, prune_mixture
-from foldgauss.estimator.em.scaling import Scaling, check_export, compute_scaling, to_mixture
+from foldgauss.estimator.em.scaling import Scaling, check_export, compute_scaling, from_mixture, to_mixture
 from foldgauss.estimator.em.statistics import Blocks, Points, enable_dtype
 from foldgauss.estimator.parameter_checks import (
     check_column,
     check_parameters,
     check_real,
     check_sizes,
+    check_start,
     make_envelope,
 )
-from foldgauss.estimator.precisions import replace_initial
 from foldgauss.estimator.prediction import (
     FittedMixture,
     predict_components,
@@ -69,9 +69,9 @@ class FoldedGaussianMixture(ClassNamePrefixFeaturesOutMixin, TransformerMixin, D
 
         p(x) = sum_k w_k N(t | m_k, sigma_k^2) N(s | loc_k + f_k(m_k - t), a_k(t) Sigma_k),   x = (s, t)
 
-    Parameters and fitted attributes are those of scikit-learn's GaussianMixture where they mean the same. With the
-    default envelope a = 1, `degree=1` *is* its model with `covariance_type="full"` and `degree=0` with
-    `covariance_type="diag"` its "diag".
+    Parameters and fitted attributes are those of scikit-learn's GaussianMixture where they mean the same; `start` takes
+    the place of its initial values and of `warm_start`. With the default envelope a = 1, `degree=1` *is* its model with
+    `covariance_type="full"` and `degree=0` with `covariance_type="diag"` its "diag".
 
     **Data larger than memory:** in place of rows (n, d), X may be chunks of rows: an iterable of arrays (n_i, d) that
     can be iterated repeatedly (such as a list), or a dask array chunked along its rows. `sample_weight` is then chunked
@@ -87,9 +87,10 @@ class FoldedGaussianMixture(ClassNamePrefixFeaturesOutMixin, TransformerMixin, D
     * `envelope`: "constant" (a = 1), "time_likelihood" (the paper's, `TimeLikelihood(power=1, floor=1e-3)`), any
       envelope, or a function as in `as_envelope`. It is not fitted; see `gradient_fit` for that.
     * `time_column`: the column of X that is time, an index or a data frame's name; by default the last one.
-    * `tol`, `max_iter`, `n_init`, `reg_covar`, `weights_init`, `means_init`, `precisions_init`, `random_state`,
-      `warm_start`, `verbose`: as in GaussianMixture. `reg_covar` is added to the variances of each Sigma_k
-      and of time, in the units of X.
+    * `tol`, `max_iter`, `n_init`, `reg_covar`, `random_state`, `verbose`: as in GaussianMixture. `reg_covar` is added
+      to the variances of each Sigma_k and of time, in the units of X.
+    * `start`: a `FoldedMixture` from which EM starts in place of `init_params`, time last, with polynomial folds of at
+      most `degree`; its envelope is ignored. `to_mixture()` of an earlier fit continues that fit.
     * `reg_relative`: this fraction of each column's own variance is added as well.
     * `init_params`: "kmeans", "k-means++", "random", "random_from_data", or "trajectories" (random curves grown along
       the points: for crossing tracks).
@@ -133,7 +134,6 @@ class FoldedGaussianMixture(ClassNamePrefixFeaturesOutMixin, TransformerMixin, D
         "n_init": [Interval(Integral, 1, None, closed="left")],
         "devices": [Interval(Integral, 1, None, closed="left")],
         "random_state": ["random_state"],
-        "warm_start": ["boolean"],
         "verbose": ["verbose"],
     }
 
@@ -152,14 +152,11 @@ class FoldedGaussianMixture(ClassNamePrefixFeaturesOutMixin, TransformerMixin, D
         n_init=1,
         init_params="kmeans",
         annealing=1.0,
-        weights_init=None,
-        means_init=None,
-        precisions_init=None,
+        start=None,
         max_components=10,
         max_degree=3,
         criterion="bic",
         random_state=None,
-        warm_start=False,
         verbose=0,
         devices=1,
     ):
@@ -175,14 +172,11 @@ class FoldedGaussianMixture(ClassNamePrefixFeaturesOutMixin, TransformerMixin, D
         self.n_init = n_init
         self.init_params = init_params
         self.annealing = annealing
-        self.weights_init = weights_init
-        self.means_init = means_init
-        self.precisions_init = precisions_init
+        self.start = start
         self.max_components = max_components
         self.max_degree = max_degree
         self.criterion = criterion
         self.random_state = random_state
-        self.warm_start = warm_start
         self.verbose = verbose
         self.devices = devices
 
@@ -258,20 +252,14 @@ class FoldedGaussianMixture(ClassNamePrefixFeaturesOutMixin, TransformerMixin, D
         elif auto and data.total < size:  # normalized weights: information criteria need the number of points
             data = data._replace(factor=size / data.total)
         mean, variance = data.moments()
-        num_columns, total = len(mean), data.total
-        envelope = make_envelope(self.envelope)
-        warm = self._warm_start(num_columns)
-        if warm is None:
-            scaling = compute_scaling(mean, variance, envelope, self.covariance_type)
-            num, degree = self._sizes(size)
-        else:
-            scaling, (num, degree) = self._scaling, warm
+        total, envelope = data.total, make_envelope(self.envelope)
+        scaling = compute_scaling(mean, variance, envelope, self.covariance_type)
+        num, degree = self._sizes(size, len(mean))
         data = data._replace(scaling=scaling)
         gaps = 0.0 if groups is None else measure_gaps(data.take()[0], groups)
         floor = (self.reg_covar + self.reg_relative * variance) / scaling.scale**2 + gaps
-        degrees = jnp.broadcast_to(jnp.asarray(degree if warm is None else self.degrees_, jnp.int32), (num,))
-        model = Model(degrees, jnp.asarray(floor, data.dtype), self.covariance_type)
-        starts = self._starts(data, scaling, model, degree, warm is not None)
+        model = Model(jnp.full(num, degree, jnp.int32), jnp.asarray(floor, data.dtype), self.covariance_type)
+        starts = self._starts(data, model, degree)
         points = data.to_points(num * len(starts.time_loc), self.devices)
         run = select_best(
             run_em(
@@ -284,15 +272,13 @@ class FoldedGaussianMixture(ClassNamePrefixFeaturesOutMixin, TransformerMixin, D
                 tol=self.tol,
                 max_steps=self.max_iter,
                 annealing=self.annealing,
-                last=-np.inf if warm is None else self.lower_bound_ + scaling.log_volume,
                 observe=_print_progress if self.verbose else None,
             )
         )
-        if auto and warm is None and run.status != EMStatus.NOT_FINITE:
+        if auto and run.status != EMStatus.NOT_FINITE:
             run, model = self._prune(run, points, envelope, model, total)
         self._scaling, self._envelope = scaling, envelope
         warn_narrow(run.params.tril, gaps)
-        self._fitted_with = self.covariance_type, self._time_index(num_columns)
         return run, model
 
     def _prune(self, run: Run, points: Points | Blocks, envelope, model: Model, total: float) -> tuple[Run, Model]:
@@ -313,24 +299,21 @@ class FoldedGaussianMixture(ClassNamePrefixFeaturesOutMixin, TransformerMixin, D
         last = run_em(starts, points, envelope, model, total=total, tol=self.tol, max_steps=self.max_iter)[0]
         return last._replace(history=run.history + last.history), model
 
-    def _sizes(self, num_points: int) -> tuple[int, int]:
+    def _sizes(self, num_points: int, num_columns: int) -> tuple[int, int]:
+        """The numbers of components and of powers to start with."""
         degree = self.max_degree if self.degree == "auto" else self.degree
+        if self.start is not None:
+            check_start(self.start, self.n_components, degree, num_columns)
+            return self.start.num_components, degree
         if self.n_components != "auto":
             return self.n_components, degree
         return max(1, min(self.max_components, num_points // _POINTS_PER_COMPONENT)), degree
 
-    def _warm_start(self, num_columns: int) -> tuple[int, int] | None:
-        """The number of components and degree to continue with; None if there is no compatible earlier fit."""
-        if not self.warm_start or not hasattr(self, "_params") or self._params.tril.shape[-1] + 1 != num_columns:
-            return None
-        same = self._fitted_with == (self.covariance_type, self._time_index(num_columns))
-        same &= self.n_components in ("auto", len(self.weights_)) and self.degree in ("auto", self._params.degree)
-        return (len(self.weights_), self._params.degree) if same else None
-
-    def _starts(self, data, scaling: Scaling, model: Model, degree: int, warm: bool) -> Parameters:
+    def _starts(self, data: Rows, model: Model, degree: int) -> Parameters:
         """Initial parameters, with a leading axis of `n_init`."""
-        if warm:
-            return jax.tree.map(lambda z: jnp.asarray(z, data.dtype)[None], self._params)
+        if self.start is not None:
+            start = from_mixture(self.start, data.scaling, degree, data.dtype)
+            return jax.tree.map(lambda z: z[None], restrict_covariances(start, self.covariance_type))
         rng = check_random_state(self.random_state)
         made, whole = [], None
         for _ in range(self.n_init):
@@ -338,7 +321,7 @@ class FoldedGaussianMixture(ClassNamePrefixFeaturesOutMixin, TransformerMixin, D
             if subset is None and whole is None:
                 whole = data.take()
             one = initialize(self.init_params, *(whole if subset is None else data.take(subset)), model, degree, rng)
-            made.append(restrict_covariances(replace_initial(self, one, scaling, degree), self.covariance_type))
+            made.append(restrict_covariances(one, self.covariance_type))
         return jax.tree.map(lambda *z: jnp.stack(z), *made)
 
     @property

@@ -11,10 +11,8 @@ from foldgauss._runtime.checks import require
 from foldgauss.estimator.em.statistics import enable_dtype
 from foldgauss.estimator.folded_gaussian_mixture import FoldedGaussianMixture
 from foldgauss.estimator.parameter_checks import check_column, check_real
+from foldgauss.estimator.prediction import map_blocks
 from foldgauss.estimator.rows import order_columns
-
-#: Rows predicted together, the last block padded: one compiled program for any number of rows.
-_BLOCK = 1024
 
 
 class FoldedMixtureRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
@@ -90,20 +88,15 @@ class FoldedMixtureRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         (values,) = self._evaluate(_quantiles, X, levels.ravel())
         return values.reshape(-1, *self._target_shape, *levels.shape)
 
-    def _evaluate(self, function, X, *args) -> list[np.ndarray]:
+    def _evaluate(self, function, X, *args) -> tuple[np.ndarray, ...]:
         """The arrays that `function` gives of p(y | x), by blocks of rows."""
         check_is_fitted(self)
         X = validate_data(self, X, dtype=np.float64, reset=False)
-        num, width = X.shape
         order = order_columns(self.mixture_.time_column, self.mixture_.n_features_in_).tolist()
-        indices = tuple(order.index(column) for column in range(width))
-        padded = np.pad(X, ((0, -num % _BLOCK), (0, 0)), mode="edge")
+        indices = tuple(order.index(column) for column in range(X.shape[1]))
         with enable_dtype(X.dtype):
             mixture = self.mixture_.to_mixture()
-            blocks = [
-                function(mixture, indices, jnp.asarray(x), *args) for x in np.split(padded, len(padded) // _BLOCK)
-            ]
-            return [np.concatenate(parts)[:num] for parts in zip(*blocks, strict=True)]
+            return map_blocks(lambda x: function(mixture, indices, jnp.asarray(x), *args), X)
 
 
 @eqx.filter_jit

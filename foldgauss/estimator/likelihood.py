@@ -11,11 +11,10 @@ from typing import NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jax import lax
 from jaxtyping import Array, ArrayLike, Bool, Float, Int, Key
 
-from foldgauss._numerics.batch import bisect, cast
+from foldgauss._numerics.batch import bisect, cast, check_values
 from foldgauss._numerics.regression import Regression, hermite, hermite_to_powers, weighted_regression
 from foldgauss._numerics.triangular import solve_upper_matrix
 from foldgauss._runtime.checks import check_one_of, invalid, is_integer, require
@@ -470,8 +469,7 @@ def _check_weights(weights, x) -> Float[Array, " n"]:
         got=f"shape {weights.shape}",
         cure="One per row of x.",
     )
-    if not isinstance(weights, jax.core.Tracer) and (np.asarray(weights) < 0).any():
-        raise invalid("weights", expected="numbers >= 0", got=f"a least of {weights.min()}", cure="0 drops a row.")
+    check_values("weights", weights, lambda value: ~(value < 0), "numbers >= 0", "0 drops a row.")
     return weights
 
 

@@ -1,12 +1,12 @@
 """Validation of the parameters of `FoldedGaussianMixture`; all errors name the parameter."""
 
-from numbers import Integral
-
 import jax
 import numpy as np
 
-from foldgauss._runtime.checks import check_one_of, invalid, require, short_repr
+from foldgauss._runtime.checks import check_one_of, is_integer, require, short_repr
 from foldgauss.envelope import AbstractEnvelope, Constant, TimeLikelihood, as_envelope, check_peak
+from foldgauss.fold import PolynomialFold
+from foldgauss.mixture import FoldedMixture
 
 _ENVELOPES = {"constant": Constant, "time_likelihood": lambda: TimeLikelihood(power=1.0, floor=1e-3)}
 
@@ -15,16 +15,33 @@ def check_parameters(estimator) -> None:
     """Raise ValueError naming the first parameter that is out of its bounds."""
     estimator._validate_params()
     make_envelope(estimator.envelope)
-    if estimator.devices > len(jax.devices()):
-        expected, cure = f"at most {len(jax.devices())}", "See jax.devices()."
-        raise invalid("devices", expected=expected, got=estimator.devices, cure=cure)
-    initial = (estimator.weights_init, estimator.means_init, estimator.precisions_init)
+    most = len(jax.devices())
     require(
-        estimator.n_components != "auto" or all(value is None for value in initial),
-        "n_components",
-        expected="a number where initial values are given",
-        got='"auto"',
-        cure="Pass their number.",
+        estimator.devices <= most,
+        "devices",
+        expected=f"at most {most}",
+        got=estimator.devices,
+        cure="See jax.devices().",
+    )
+
+
+def check_start(start, n_components, degree: int, num_columns: int) -> None:
+    """Raise unless EM can start from this mixture."""
+    require(
+        isinstance(start, FoldedMixture)
+        and start.logits.ndim == 1
+        and isinstance(start.components.fold, PolynomialFold),
+        "start",
+        expected="one FoldedMixture with polynomial folds",
+        got=type(start).__name__,
+        cure="Such as `to_mixture()` of an earlier fit.",
+    )
+    num, dim, own = start.num_components, start.event_shape[0], start.components.fold.degree
+    require(
+        n_components in ("auto", num) and dim == num_columns and own <= degree,
+        "start",
+        expected=f"{n_components} components of {num_columns} coordinates, of at most degree {degree}",
+        got=f"{num} of {dim} coordinates, of degree {own}",
     )
 
 
@@ -50,10 +67,14 @@ def check_sizes(num_columns: int, num_points: int, total: float, least: int) -> 
 def check_column(column, num_columns: int, names=None, parameter: str = "time_column") -> int:
     """The index of a column, not negative, given by index or by its name in a data frame with these `names`."""
     index = list(names).index(column) if names is not None and column in list(names) else column
-    if not isinstance(index, Integral) or isinstance(index, bool) or not -num_columns <= index < num_columns:
-        known = f", or one of {', '.join(names)}" if names is not None else ""
-        cure = "-1 is the last." if names is not None or not isinstance(column, str) else "Names need a data frame."
-        raise invalid(parameter, expected=f"a column of {num_columns}{known}", got=repr(column), cure=cure)
+    known = "" if names is None else f", or one of {', '.join(names)}"
+    require(
+        is_integer(index, -num_columns) and index < num_columns,
+        parameter,
+        expected=f"a column of {num_columns}{known}",
+        got=repr(column),
+        cure="-1 is the last. Names need a data frame.",
+    )
     return int(index) % num_columns
 
 
@@ -70,28 +91,17 @@ def check_real(name: str, X) -> None:
         )
 
 
-def check_array(name: str, value, shape: tuple[int, ...]) -> np.ndarray:
-    """`value` as a finite float64 array of this shape."""
-    value = np.asarray(value, np.float64)
-    require(np.isfinite(value).all(), name, expected="finite numbers", got="NaN or infinity")
-    require(
-        value.shape == shape,
-        name,
-        expected=f"shape {shape}",
-        got=f"shape {value.shape}",
-        cure="One entry per component.",
-    )
-    return value
-
-
 def make_envelope(envelope) -> AbstractEnvelope:
     """The envelope itself, that of a function, or the one with this name. Raises ValueError for anything else."""
     if isinstance(envelope, str):
         check_one_of("envelope", envelope, tuple(_ENVELOPES))
         return _ENVELOPES[envelope]()
-    if isinstance(envelope, type) or not (callable(envelope) or isinstance(envelope, AbstractEnvelope)):
-        expected = f"an envelope, a function (t, time_loc, time_scale) -> log a, or one of {', '.join(_ENVELOPES)}"
-        raise invalid("envelope", expected=expected, got=short_repr(envelope))
+    require(
+        isinstance(envelope, AbstractEnvelope) or (callable(envelope) and not isinstance(envelope, type)),
+        "envelope",
+        expected=f"an envelope, a function (t, time_loc, time_scale) -> log a, or one of {', '.join(_ENVELOPES)}",
+        got=short_repr(envelope),
+    )
     envelope = as_envelope(envelope)
     check_peak(envelope, 0.0, 1.0)
     return envelope

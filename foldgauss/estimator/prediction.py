@@ -1,5 +1,6 @@
 """Evaluation of a fitted mixture at rows of X, in a form that can be sent to workers."""
 
+import functools
 import math
 from collections.abc import Callable
 from typing import NamedTuple
@@ -45,13 +46,18 @@ def predict_components(fitted: FittedMixture, x: Float[np.ndarray, "n d"]) -> In
 def _evaluate_rows(method: Callable, fitted: FittedMixture, x: np.ndarray) -> np.ndarray:
     """A method of the mixture at rows of X."""
     y = fitted.scaling.apply(x[:, fitted.order].astype(np.result_type(x, fitted.mixture.logits)))
-    rows = min(max(2 ** math.ceil(math.log2(max(len(y) / _NUM_BLOCKS, 1))), _LEAST_ROWS), _MOST_ROWS)
-    num_blocks = max(math.ceil(len(y) / rows), 1)
-    padded = np.pad(y, ((0, num_blocks * rows - len(y)), (0, 0)))
     with enable_dtype(y.dtype):
         mixture = jax.tree.map(lambda z: jnp.asarray(z, y.dtype), fitted.mixture)
-        blocks = [_call(method, mixture, block) for block in np.split(padded, num_blocks)]
-        return np.concatenate([np.asarray(block) for block in blocks])[: len(y)]
+        return map_blocks(functools.partial(_call, method, mixture), y)
+
+
+def map_blocks(function: Callable, y: Float[np.ndarray, "n d"]):
+    """The arrays of a function of rows, called for blocks of them; the last block is filled up."""
+    rows = min(max(2 ** math.ceil(math.log2(max(len(y) / _NUM_BLOCKS, 1))), _LEAST_ROWS), _MOST_ROWS)
+    num_blocks = max(math.ceil(len(y) / rows), 1)
+    blocks = np.split(np.pad(y, ((0, num_blocks * rows - len(y)), (0, 0))), num_blocks)
+    parts = list(map(function, blocks))  # JAX returns before they are computed
+    return jax.tree.map(lambda *parts: np.concatenate(parts)[: len(y)], *parts)
 
 
 @compile_eager(static=("method",))

@@ -5,7 +5,7 @@ import pytest
 import scipy.stats
 
 from foldgauss.uncertainty import FrameTimeLogProb, ProfileCurves, exact_posterior
-from foldgauss.uncertainty.posterior.increments import log_prior, logits_of
+from foldgauss.uncertainty.posterior.log_prob import log_prior, logits_of
 
 
 @pytest.mark.parametrize("concentration", [1.0, 1.5, 4.0])

@@ -18,8 +18,8 @@ from foldgauss.uncertainty import (
     likelihood_profiles,
 )
 from foldgauss.uncertainty.likelihood import likelihood_profiles as drawing
-from foldgauss.uncertainty.likelihood.residuals import Sketches
-from foldgauss.uncertainty.posterior.increments import log_prior
+from foldgauss.uncertainty.likelihood.residuals import random_projection
+from foldgauss.uncertainty.posterior.log_prob import log_prior
 from foldgauss.video.models.shared_paths import SharedPaths
 
 
@@ -197,10 +197,10 @@ def test_a_reach_that_is_too_short_is_widened(monkeypatch):
 
 def test_sketches_keep_distances_of_images():
     rng = np.random.default_rng(0)
-    sketches = Sketches(3 * 40 * 60)
+    projection = random_projection(3 * 40 * 60)
     pictures = rng.random((12, 3, 40, 60), np.float32) * (rng.random((12, 1, 40, 60)) < 0.1)
     pictures = pictures.astype(np.float32)
-    made = np.stack([sketches.sketch(picture) for picture in pictures])
+    made = np.stack([projection @ picture.ravel() for picture in pictures])
     for one, other in ((0, 1), (2, 3), (4, 5), (6, 7), (8, 9), (10, 11)):
         truth = np.square(pictures[one] - pictures[other]).sum()
         assert np.square(made[one] - made[other]).sum() == pytest.approx(truth, rel=0.3)

@@ -17,7 +17,7 @@ from foldgauss.uncertainty import (
     exact_posterior,
     frame_time_posterior,
 )
-from foldgauss.uncertainty.posterior import increments, log_prob, moves
+from foldgauss.uncertainty.posterior import log_prob, moves
 
 #: Two of the three are so near that their order constrains them.
 NEAR = (0.3, 0.34, 0.7), (0.03, 0.05, 0.04)
@@ -87,7 +87,8 @@ def test_few_frames_sample_the_known_posterior(near):
 def test_wrong_prior_is_detected(monkeypatch):
     # One power of every increment too many in the density that a move of emcee samples, not in the exact posterior.
     monkeypatch.setattr(moves, "FrameSweep", lambda log_prob: emcee.moves.DEMove())
-    wrong = lambda times, concentration: increments.log_prior(times, concentration + 1)  # noqa: E731
+    prior = log_prob.log_prior
+    wrong = lambda times, concentration: prior(times, concentration + 1)  # noqa: E731
     monkeypatch.setattr(log_prob, "log_prior", wrong)
     assert not agrees(sampled(toy(*NEAR)))
 

@@ -30,7 +30,7 @@ from foldgauss.uncertainty.diagnostics import plots
 from foldgauss.uncertainty.diagnostics.irregularities import irregularities
 from foldgauss.uncertainty.diagnostics.report import frame_table, summary
 from foldgauss.uncertainty.likelihood.noise import NOISES
-from foldgauss.uncertainty.posterior.increments import check_prior
+from foldgauss.uncertainty.posterior.log_prob import check_prior
 from foldgauss.uncertainty.posterior.result import FrameTimePosterior
 from foldgauss.uncertainty.posterior.sampling import check_settings
 from foldgauss.video.models.video_model import VideoModel

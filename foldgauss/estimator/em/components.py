@@ -17,9 +17,8 @@ from jaxtyping import Array, Float
 
 from foldgauss._numerics.batch import cast
 from foldgauss._numerics.regression import hermite_to_powers
-from foldgauss._numerics.triangular import UNROLLED_SIZE
+from foldgauss._numerics.triangular import UNROLLED_SIZE, inverse_lower, log_det
 from foldgauss.envelope import AbstractEnvelope, Constant
-from foldgauss.estimator.em.cholesky import inverse_lower, log_det
 
 _LOG_2PI = math.log(2 * math.pi)
 

@@ -74,21 +74,6 @@ def _maximize(params: Parameters, points: Points, padded, model: Model) -> Param
     return update_components(params, accumulate(params, Constant(), points, responsibilities=padded), model)[0]
 
 
-def params_from_gaussians(weights, means, covariances, degree: int, dtype) -> Parameters:
-    """Components with linear folds from joint Gaussians of space and time, in scaled units."""
-    variance = covariances[:, -1, -1]
-    slope = covariances[:, :-1, -1] / variance[:, None]
-    conditional = covariances[:, :-1, :-1] - slope[:, :, None] * covariances[:, None, :-1, -1]
-    curve = np.zeros((len(means), degree + 1, means.shape[1] - 1))
-    curve[:, 0] = means[:, :-1]
-    if degree:
-        curve[:, 1] = -slope * np.sqrt(variance)[:, None]  # v decreases with time
-    with np.errstate(divide="ignore"):  # of a weight of 0
-        log_weights = np.log(weights)
-    parts = (log_weights, means[:, -1], np.sqrt(variance), curve, np.linalg.cholesky(conditional))
-    return Parameters(*(jnp.asarray(z, dtype) for z in parts))
-
-
 def restrict_covariances(params: Parameters, kind: str) -> Parameters:
     """Replace the covariances by those of the kind that is fitted, which EM's updates then preserve."""
     tril = np.asarray(params.tril, np.float64)

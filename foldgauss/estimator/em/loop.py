@@ -148,11 +148,9 @@ def run_em(
     tol: float = 1e-3,
     max_steps: int = 100,
     annealing: float = 1.0,
-    last: float = -np.inf,
     observe=None,
 ) -> list[Run]:
-    """Run EM from every start (leading axis) at once; `total` is the sum of weights, and `last` the mean log-likelihood
-    before the start, if a run is continued.
+    """Run EM from every start (leading axis) at once; `total` is the sum of weights.
 
     A component with less mass than `least_mass` is reset to half of the heaviest one, at most as often as there are
     components. A run has converged when the mean log-likelihood changes by less than `tol`, at temperature 1 (for at
@@ -160,7 +158,7 @@ def run_em(
     """
     first_end = 1 if annealing == 1.0 else ANNEALING_STEPS + SETTLING_STEPS
     states, restarts = State(starts, jnp.ones_like(starts.time_loc)), len(starts.time_loc)
-    before, lasts = states, np.full(restarts, last)
+    before, lasts = states, np.full(restarts, -np.inf)
     statuses = np.full(restarts, EMStatus.NOT_CONVERGED)
     done, resets, histories = np.zeros(restarts, bool), np.zeros(restarts, int), [[] for _ in range(restarts)]
     for number in range(1, max_steps + 1):

@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from foldgauss._numerics.regression import hermite_to_powers
-from foldgauss.estimator.em.cholesky import cholesky, inverse_lower, log_det
+from foldgauss._numerics.triangular import cholesky, inverse_lower, log_det
 from foldgauss.estimator.em.components import Parameters, change_variable, to_powers
 from foldgauss.estimator.em.statistics import SufficientStatistics, Times, step_times
 

@@ -12,8 +12,8 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from foldgauss._numerics.regression import hermite_to_powers
+from foldgauss._numerics.triangular import cholesky, inverse_lower, log_det
 from foldgauss.envelope import AbstractEnvelope
-from foldgauss.estimator.em.cholesky import cholesky, inverse_lower, log_det
 from foldgauss.estimator.em.components import Parameters, evaluate_densities, to_powers
 from foldgauss.estimator.em.loop import log_likelihood, run_em, select_best
 from foldgauss.estimator.em.m_step import Model, residual_scatter

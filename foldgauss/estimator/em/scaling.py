@@ -2,11 +2,12 @@
 
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from foldgauss._runtime.checks import invalid, require
+from foldgauss._runtime.checks import require
 from foldgauss.distribution import FoldedGaussian
 from foldgauss.envelope import AbstractEnvelope, Constant, TimeLikelihood
 from foldgauss.estimator.em.components import Parameters
@@ -51,9 +52,13 @@ def check_time_resolution(name: str, x, dtype) -> None:
     if not isinstance(x, np.ndarray) or x.dtype == dtype or x.ndim != 2 or not x.size:
         return
     t = x[np.isfinite(x[:, -1]), -1].astype(np.float64)
-    if len(t) and np.spacing(np.abs(t).max().astype(dtype)) > _MAX_SPACING * t.std() > 0:
-        expected, got = f"times that {np.dtype(dtype).name} resolves", f"times from {t.min():.10g} to {t.max():.10g}"
-        raise invalid(name, expected=expected, got=got, cure=_COARSE_CURE)
+    require(
+        not len(t) or not np.spacing(np.abs(t).max().astype(dtype)) > _MAX_SPACING * t.std() > 0,
+        name,
+        expected=f"times that {np.dtype(dtype).name} resolves",
+        got=f"times from {t.min(initial=np.inf):.10g} to {t.max(initial=-np.inf):.10g}",
+        cure=_COARSE_CURE,
+    )
 
 
 def check_export(params: Parameters, scaling: Scaling, dtype, origin: float | None) -> None:
@@ -66,10 +71,14 @@ def check_export(params: Parameters, scaling: Scaling, dtype, origin: float | No
     step = np.spacing((np.abs(times - (origin or 0)) + 3 * spread).astype(dtype)).astype(np.float64) / spread
     speed = np.abs(curve[:, 1:2]).sum(1) / np.sqrt((tril**2).sum(-1))
     worst = float((step * np.maximum(1, speed.max(1, initial=0))).max())
-    if worst > _MAX_SPACING:
-        got = f"{np.dtype(dtype).name}, whose adjacent times differ by {worst:.2g} of a component's spread"
-        cure = "" if origin is None else f"Pass time_origin={round(times.mean())}, from which times are then counted. "
-        raise invalid("times", expected="a dtype that resolves them", got=got, cure=cure + _COARSE_CURE)
+    cure = "" if origin is None else f"Pass time_origin={times.mean():.0f}, from which times are then counted. "
+    require(
+        not worst > _MAX_SPACING,
+        "times",
+        expected="a dtype that resolves them",
+        got=f"{np.dtype(dtype).name}, whose adjacent times differ by {worst:.2g} of a component's spread",
+        cure=cure + _COARSE_CURE,
+    )
     require(
         not (params.degree + 1) * np.abs(np.log(spread)).max() > np.log(float(np.finfo(dtype).max)),
         "times",
@@ -77,6 +86,21 @@ def check_export(params: Parameters, scaling: Scaling, dtype, origin: float | No
         got=f"spreads of time up to {spread.max():.2g} at degree {params.degree}, out of range of {np.dtype(dtype)}",
         cure="Divide the time column, or use float64.",
     )
+
+
+def from_mixture(mixture: FoldedMixture, scaling: Scaling, degree: int, dtype) -> Parameters:
+    """The inverse of `to_mixture`, with 0 for powers up to `degree` that the folds do not have."""
+    of = mixture.components
+    parts = (of.loc, of.scale_tril, of.time_loc, of.time_scale, of.fold.coefficients)
+    loc, tril, time_loc, time_scale, coefficients = (np.asarray(z, np.float64) for z in parts)
+    space, time = scaling.scale[:-1], scaling.scale[-1]
+    curve = np.zeros((len(loc), degree + 1, len(space)))
+    curve[:, 0] = (loc - scaling.shift[:-1]) / space
+    powers = time_scale[:, None, None] ** np.arange(1, of.fold.degree + 1)[None, :, None]
+    curve[:, 1 : of.fold.degree + 1] = coefficients * powers / space
+    times = (time_loc - scaling.shift[-1]) / time, time_scale / time
+    parts = (jax.nn.log_softmax(jnp.asarray(mixture.logits, dtype)), *times, curve, tril / space[:, None])
+    return Parameters(*(jnp.asarray(z, dtype) for z in parts))
 
 
 def to_mixture(params: Parameters, scaling: Scaling, envelope: AbstractEnvelope, origin: float = 0.0) -> FoldedMixture:

@@ -20,7 +20,7 @@ from foldgauss.uncertainty.diagnostics.irregularities import (
     irregularities,
 )
 from foldgauss.uncertainty.likelihood.likelihood_profiles import LikelihoodProfiles
-from foldgauss.uncertainty.likelihood.noise import LAST_CORRELATION
+from foldgauss.uncertainty.likelihood.noise import LAST_CORRELATION, correlated_reach
 from foldgauss.uncertainty.posterior.result import FrameTimePosterior
 
 _BLUE = "#1f4e79"
@@ -151,9 +151,7 @@ def plot_correlation(profiles: LikelihoodProfiles, ax: Any = None) -> Any:
     """
     ax = _axes(ax, (6, 3.6))
     correlation = np.asarray(profiles.residual_correlation)
-    below = np.flatnonzero(correlation < LAST_CORRELATION)
-    reach = int(below[0]) if below.size else len(correlation) - 1
-    last = min(len(correlation), max(3 * reach, 12) + 1)
+    last = min(len(correlation), max(3 * correlated_reach(correlation), 12) + 1)
     ax.plot(np.arange(last), correlation[:last], "o-", color=_BLUE, markersize=3.5, linewidth=1.2)
     ax.axhline(0, color=_GRAY, linewidth=0.6)
     ax.axhline(LAST_CORRELATION, color=_RED, linewidth=0.8, linestyle="--")

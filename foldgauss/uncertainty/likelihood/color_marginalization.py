@@ -145,7 +145,7 @@ class _Curve:
 
     def evaluate(self, t: float) -> None:
         if t not in self.times:
-            point = self.point(self.equations.at(self.k, t))
+            point = self.point(FrameAt(self.equations, self.k, t))
             place = bisect.bisect(self.times, t)
             self.times.insert(place, t)
             self.points.insert(place, point)
@@ -264,31 +264,29 @@ def _time_of_fall(times: np.ndarray, values: np.ndarray) -> float:
     beyond = np.flatnonzero(values <= -REACH)
     if not beyond.size:
         return float(times[-1])
-    n = beyond[0]
-    fraction = (values[n - 1] + REACH) / (values[n - 1] - values[n])
-    return float(times[n - 1] + fraction * (times[n] - times[n - 1]))
+    pair = slice(beyond[0] - 1, beyond[0] + 1)
+    return float(np.interp(REACH, -values[pair], times[pair]))
 
 
 def _join(
     times: np.ndarray, values: np.ndarray, base_nodes: np.ndarray, base_values: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Continue the profile on both sides by the base's nodes."""
-    base = ProfileCurves.from_nodes([base_nodes], [base_values])
-    sides = []
-    for end, inward in ((0, 1), (-1, -2)):
-        spacing = abs(times[inward] - times[end])
-        beyond = base_nodes < times[end] - spacing if end == 0 else base_nodes > times[end] + spacing
-        if not beyond.any():  # at least the end of the base
-            beyond[end] = base_nodes[end] < times[end] if end == 0 else base_nodes[end] > times[end]
-        nodes = base_nodes[beyond]
-        falls = float(base(times[[end]])[0]) - base_values[beyond]
-        if len(nodes):
-            first = -1 if end == 0 else 0
-            steepness = max(values[inward] - values[end], 1.0) / spacing
-            wanted = steepness * abs(nodes[first] - times[end])
-            fraction = min(1.0, wanted / falls[first]) if falls[first] > 0 else 1.0
-            sides.append((nodes, values[end] - np.maximum(fraction * falls, 0)))
-        else:
-            sides.append((nodes, falls))
-    (before, low), (after, high) = sides
-    return np.concatenate([before, times, after]), np.concatenate([low, values, high])
+    after, high = _continue(times, values, base_nodes, base_values)
+    before, low = _continue(-times[::-1], values[::-1], -base_nodes[::-1], base_values[::-1])
+    return np.concatenate([-before[::-1], times, after]), np.concatenate([low[::-1], values, high])
+
+
+def _continue(
+    times: np.ndarray, values: np.ndarray, base_nodes: np.ndarray, base_values: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """The base's nodes after the profile, at least its last one, and values there."""
+    spacing = times[-1] - times[-2]
+    beyond = base_nodes > times[-1] + spacing
+    beyond[-1] = base_nodes[-1] > times[-1]
+    nodes = base_nodes[beyond]
+    falls = ProfileCurves.from_nodes([base_nodes], [base_values])(times[-1:]) - base_values[beyond]
+    if len(nodes) and falls[0] > 0:
+        steepness = max(values[-2] - values[-1], 1.0) / spacing
+        falls = falls * min(1.0, steepness * (nodes[0] - times[-1]) / falls[0])
+    return nodes, values[-1] - np.maximum(falls, 0)

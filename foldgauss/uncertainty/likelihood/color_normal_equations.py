@@ -16,8 +16,6 @@ from foldgauss.video.models.background import BLACK
 from foldgauss.video.models.conditioning import PreparedModel
 from foldgauss.video.models.splats import SH_C0
 
-#: Frames whose Gram matrices are computed at once.
-BATCH = 8
 #: Gaussians per block of the preconditioner: larger blocks cost about as much time as they save.
 BLOCK = 512
 #: Iteration limit of the solver. The 40,000 Gaussians of a fitted clip take 40 to 200.
@@ -64,21 +62,13 @@ class ColorEquations:
 
     def _accumulate(self, prior_scale: float) -> None:
         self.matrix = scipy.sparse.diags_array(np.full(self.num, prior_scale**-2), format="csr")
-        self.rhs, batch = np.zeros((self.num, 3)), []
+        self.rhs = np.zeros((self.num, 3))
         for k, t in enumerate(self.times):
             here = self.weights(t)
             self.rhs += here.T @ self.residual(k, here) / self.variance[k]
-            here.data /= np.sqrt(self.variance[k])
-            batch.append(here)
-            if len(batch) == BATCH or k + 1 == len(self.times):
-                rows = scipy.sparse.vstack(batch, format="csr")
-                self.matrix = (self.matrix + rows.T @ rows).tocsr()
-                batch = []
+            self.matrix = self.matrix + here.T @ here / self.variance[k]
+        self.matrix = self.matrix.tocsr()
         self.matrix.sort_indices()
-
-    def at(self, k: int, t: float) -> "FrameAt":
-        """The equations with frame k at time t instead of its own."""
-        return FrameAt(self, k, t)
 
     @functools.cached_property
     def precondition(self) -> Callable[[np.ndarray], np.ndarray]:

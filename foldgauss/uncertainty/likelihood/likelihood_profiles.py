@@ -8,7 +8,7 @@ from collections.abc import Callable
 import numpy as np
 from jaxtyping import Float64, UInt8
 
-from foldgauss._runtime.checks import invalid, require
+from foldgauss._runtime.checks import require
 from foldgauss.uncertainty.likelihood.noise import (
     NOISES,
     FrameNoise,
@@ -18,7 +18,7 @@ from foldgauss.uncertainty.likelihood.noise import (
     score_fraction,
 )
 from foldgauss.uncertainty.likelihood.profile_curves import ProfileCurves
-from foldgauss.uncertainty.likelihood.residuals import Residuals, Sketches
+from foldgauss.uncertainty.likelihood.residuals import Residuals, random_projection
 from foldgauss.video.models.video_model import VideoModel
 
 #: Coarse nodes in each interval between two frame times.
@@ -104,11 +104,21 @@ def likelihood_profiles(
         got=num_frames,
         cure="The first frame is at time 0 and the last at 1: others are needed.",
     )
-    if isinstance(noise, FrameNoise):
-        noise = noise.for_frames(num_frames)
-    elif not isinstance(noise, str) or noise not in NOISES:
-        raise invalid("noise", expected=f"one of {', '.join(NOISES)}, or a FrameNoise", got=noise)
-    _check_changes(residuals.frames)
+    given = isinstance(noise, FrameNoise)
+    require(
+        given or (isinstance(noise, str) and noise in NOISES),
+        "noise",
+        expected=f"one of {', '.join(NOISES)}, or a FrameNoise",
+        got=noise,
+    )
+    noise = noise.for_frames(num_frames) if given else noise
+    require(
+        any((frame != residuals.frames[0]).any() for frame in residuals.frames),
+        "video",
+        expected="frames that differ",
+        got=f"{num_frames} equal frames",
+        cure="Times cannot be inferred where nothing changes.",
+    )
     builder = ProfileBuilder(residuals, on_render)
     builder.compare_coarse()
     notes = _check_paths(model) + _check_explained(residuals.frames, builder)
@@ -129,7 +139,7 @@ class ProfileBuilder:
         self.model_times = np.asarray(residuals.model.frame_times.times(), np.float64)
         self.finest = FINEST / COARSE * float(np.median(np.diff(self.model_times)))
         self.reach = num_frames if num_frames <= MOST_EVERYWHERE else REACH
-        self.sketches = Sketches(3 * residuals.model.size[0] * residuals.model.size[1])
+        self.projection = random_projection(residuals.frames[0].size)
         self.samples = [_Samples() for _ in range(num_frames)]
 
     def _render(self, times):
@@ -154,7 +164,7 @@ class ProfileBuilder:
         found = [([], [], []) for _ in range(num_frames)]
         for n, (t, image) in enumerate(self._render(times)):
             near = np.flatnonzero(np.abs(np.arange(num_frames) - position[n]) <= self.reach)
-            sketch = self.sketches.sketch(image)
+            sketch = self.projection @ image.ravel()
             for k, error in zip(near, self.residuals.squared_errors(image, near), strict=True):
                 for each, value in zip(found[k], (t, error, sketch), strict=True):
                     each.append(value)
@@ -179,7 +189,7 @@ class ProfileBuilder:
         inner = range(1, len(self.samples) - 1)
         while wanted := [(t, k) for k in inner for t in self.samples[k].wanted(noise.weight[k], self.finest)]:
             compared = [
-                (self.residuals.squared_errors(image, [k])[0], self.sketches.sketch(image))
+                (self.residuals.squared_errors(image, [k])[0], self.projection @ image.ravel())
                 for (_, k), (_, image) in zip(wanted, self._render([t for t, _ in wanted]), strict=True)
             ]
             first = 0
@@ -265,17 +275,6 @@ class _Samples:
         self.times = np.insert(self.times, left + 1, middles)
         self.errors = np.insert(self.errors, left + 1, errors)
         self.sketches = np.insert(self.sketches, left + 1, sketches, axis=0)
-
-
-def _check_changes(frames: np.ndarray) -> None:
-    first = frames[0]
-    require(
-        not all(np.array_equal(first, frame) for frame in frames[1:]),
-        "video",
-        expected="frames that differ",
-        got=f"{len(frames)} equal frames",
-        cure="Times cannot be inferred where nothing changes.",
-    )
 
 
 def check_explained(left: float, variance: float) -> None:

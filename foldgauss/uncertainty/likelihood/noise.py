@@ -118,11 +118,9 @@ def autocorrelation(
     """
     same = np.einsum("ccyx->yx", covariance)
     most = len(same) // 2
-    if same[most, most] == 0:
-        correlation = np.zeros_like(same)
-        correlation[most, most] = 1.0
-        return correlation
-    return same / same[most, most]
+    correlation = same / (same[most, most] or 1.0)
+    correlation[most, most] = 1.0
+    return correlation
 
 
 def rings(correlation: Float64[np.ndarray, "rows columns"]) -> Float64[np.ndarray, " lags"]:
@@ -134,9 +132,8 @@ def rings(correlation: Float64[np.ndarray, "rows columns"]) -> Float64[np.ndarra
     return np.bincount(distance[inside], correlation[inside]) / np.bincount(distance[inside])
 
 
-def correlated_reach(covariance: _Covariance) -> int:
-    """The first ring of lags, in pixels, whose mean correlation is below `LAST_CORRELATION`."""
-    correlation = rings(autocorrelation(covariance))
+def correlated_reach(correlation: Float[np.ndarray, " lags"]) -> int:
+    """The first of the `rings` whose mean correlation is below `LAST_CORRELATION`; their number if there is none."""
     below = np.flatnonzero(correlation < LAST_CORRELATION)
     return int(below[0]) if below.size else len(correlation)
 
@@ -170,7 +167,7 @@ def score_fraction(
     plain = (residual**2).mean() * (slope**2).sum()
     if not (power > 0 and plain > 0):
         return 1.0
-    reach = min(max(2 * correlated_reach(covariance), 1), middle)
+    reach = min(max(2 * correlated_reach(rings(autocorrelation(covariance))), 1), middle)
     near = slice(middle - reach, middle + reach + 1)
     flat = np.clip(2 - 2 * np.abs(np.arange(-reach, reach + 1)) / (reach + 1), 0, 1)
     weights = flat[:, None] * flat[None, :]

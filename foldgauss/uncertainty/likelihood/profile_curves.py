@@ -7,7 +7,7 @@ import numba as nb
 import numpy as np
 from jaxtyping import Float, Float64, Int
 
-from foldgauss._runtime.checks import invalid, require
+from foldgauss._runtime.checks import require
 from foldgauss._runtime.kernels import inline, kernel
 
 _d = nb.float64
@@ -57,8 +57,7 @@ class ProfileCurves:
                 expected=f"{height.size} increasing times",
                 got=f"shape {times.shape}",
             )
-            if not np.isfinite(height).all():
-                raise invalid(f"values[{k}]", expected="finite log-likelihoods", got=height[~np.isfinite(height)][0])
+            require(np.isfinite(height).all(), f"values[{k}]", expected="finite log-likelihoods", got=height.tolist())
             table[:, k, : count[k]] = times, height, np.gradient(height, times, edge_order=2)
         return cls(*table, count)
 

@@ -14,11 +14,10 @@ import math
 from collections.abc import Callable
 
 import numpy as np
-import scipy.stats
 from jaxtyping import Float, Float64, UInt8
 
 from foldgauss._numerics.random_streams import Stream, make_generator, seed_sequence
-from foldgauss._runtime.checks import check_within, is_integer, require
+from foldgauss._runtime.checks import is_integer, require
 from foldgauss.uncertainty.likelihood.likelihood_profiles import check_explained
 from foldgauss.uncertainty.likelihood.residuals import Residuals
 from foldgauss.video.fitting.config import FitConfig, planned_steps
@@ -43,11 +42,6 @@ class RefitTimes:
     own: Float64[np.ndarray, " num_frames"]
 
     @property
-    def mean(self) -> Float64[np.ndarray, " num_frames"]:
-        """Mean time of each frame."""
-        return self.times.mean(0)
-
-    @property
     def std(self) -> Float64[np.ndarray, " num_frames"]:
         """Standard deviation of each frame's time, 0 for the first and the last."""
         return self.times.std(0, ddof=1)
@@ -68,15 +62,6 @@ class RefitTimes:
         difference = np.zeros_like(self.times)
         difference[:, 1:-1] = self.times[:, 1:-1] - (self.times[:, :-2] + self.times[:, 2:]) / 2
         return difference.std(0, ddof=1)
-
-    def interval(self, level: float = 0.95) -> tuple[Float64[np.ndarray, " num_frames"], ...]:
-        """(low, high) of each frame's time, in [0, 1]: the model's own less and plus Student's quantile times `std`.
-
-        Raises ValueError for a level outside (0, 1).
-        """
-        check_within("level", level, "(0, 1)", "a number in (0, 1)")
-        reach = scipy.stats.t.ppf((1 + level) / 2, len(self.times) - 1) * self.std
-        return np.clip(self.own - reach, 0.0, 1.0), np.clip(self.own + reach, 0.0, 1.0)
 
     def ratio_to(self, std: Float[np.ndarray, " num_frames"]) -> float:
         """Ratio to another `std`: root mean square over frames, except the first and the last.

@@ -16,12 +16,12 @@ import dataclasses
 
 import numpy as np
 from jaxtyping import Float64
-from scipy.special import betainc, betaincc
+from scipy.special import betainc, betaincc, logsumexp
 
 from foldgauss._numerics.random_streams import Stream, make_generator
 from foldgauss._runtime.checks import check_within, invalid, require
 from foldgauss.uncertainty.likelihood.profile_curves import ProfileCurves
-from foldgauss.uncertainty.posterior.increments import check_prior
+from foldgauss.uncertainty.posterior.log_prob import check_prior
 
 #: Cells per frame. Half of them have equal masses and half have equal widths.
 CELLS = 200
@@ -176,7 +176,7 @@ def _passes(curves: ProfileCurves, edges: list[np.ndarray], alpha: float):
         logs = forward[n] + message[::-1] + prior
         if not logs.max() > -np.inf:
             raise _out_of_order()
-        masses.append(np.exp(logs - _log_sum(logs)))
+        masses.append(np.exp(logs - logsumexp(logs)))
     return masses, forward, log_evidence
 
 
@@ -187,7 +187,7 @@ def _out_of_order() -> ValueError:
 
 def _predict(edges: np.ndarray, message: np.ndarray, gaps: int, alpha: float, times: np.ndarray) -> np.ndarray:
     """Log of the mean of exp(message) at `times` B for B of Beta(alpha gaps, alpha): the predicted message."""
-    return _log_sum(message + _log_weights(edges, gaps, alpha, times))
+    return logsumexp(message + _log_weights(edges, gaps, alpha, times), axis=1)
 
 
 def _log_weights(edges: np.ndarray, gaps: int, alpha: float, times: np.ndarray) -> Float64[np.ndarray, "times cells"]:
@@ -205,13 +205,6 @@ def _log_weights(edges: np.ndarray, gaps: int, alpha: float, times: np.ndarray) 
             above[at_upper] = betaincc(alpha * gaps, alpha, fraction[at_upper])
             inside = np.log(np.where(upper, -np.diff(above), np.diff(below)))
     return np.where(np.isnan(inside), -np.inf, inside)
-
-
-def _log_sum(logs: np.ndarray) -> np.ndarray:
-    """log-sum-exp over the last axis."""
-    top = np.maximum(logs.max(-1), -np.finfo(float).max)
-    with np.errstate(divide="ignore"):
-        return top + np.log(np.exp(logs - top[..., None]).sum(-1))
 
 
 def _draw(

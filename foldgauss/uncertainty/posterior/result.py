@@ -11,8 +11,7 @@ from foldgauss._runtime.checks import check_within
 from foldgauss._runtime.optional_imports import import_optional
 from foldgauss.uncertainty.likelihood.likelihood_profiles import LikelihoodProfiles
 from foldgauss.uncertainty.posterior.exact import ExactPosterior
-from foldgauss.uncertainty.posterior.increments import logits_of
-from foldgauss.uncertainty.posterior.log_prob import FrameTimeLogProb
+from foldgauss.uncertainty.posterior.log_prob import FrameTimeLogProb, logits_of
 
 if TYPE_CHECKING:
     import arviz

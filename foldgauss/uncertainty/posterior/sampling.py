@@ -69,12 +69,15 @@ def frame_time_posterior(
     import_optional("emcee", "uncertainty")
     import_optional("arviz", "uncertainty")
     check_settings(steps, ensembles, seed)
-    if not isinstance(profiles, LikelihoodProfiles):
-        raise invalid("profiles", expected="the result of `likelihood_profiles`", got=short_repr(profiles))
-    log_prob = FrameTimeLogProb(profiles.curves, concentration)
-    return _Run(log_prob, profiles, ensembles, seed, _check_backend(backend)).sample_until_converged(
-        int(steps) // THIN, on_progress
+    require(
+        isinstance(profiles, LikelihoodProfiles),
+        "profiles",
+        expected="the result of `likelihood_profiles`",
+        got=short_repr(profiles),
     )
+    log_prob = FrameTimeLogProb(profiles.curves, concentration)
+    run = _Run(log_prob, profiles, ensembles, seed, None if backend is None else Path(backend))
+    return run.sample_until_converged(int(steps) // THIN, on_progress)
 
 
 def check_settings(steps: int, ensembles: int, seed: int) -> None:
@@ -87,21 +90,6 @@ def check_settings(steps: int, ensembles: int, seed: int) -> None:
     )
     require(is_integer(steps, THIN), "steps", expected=f"a whole number >= {THIN}", got=short_repr(steps))
     require(is_integer(seed, 0), "seed", expected="a whole number >= 0", got=short_repr(seed))
-
-
-def _check_backend(backend: str | os.PathLike | None) -> Path | None:
-    """A path that can be written."""
-    if backend is None:
-        return None
-    import_optional("h5py", "uncertainty")
-    path = Path(backend)
-    require(
-        not path.is_dir() and os.access(path.parent, os.W_OK),
-        "backend",
-        expected="a file in a folder that can be written to",
-        got=str(path),
-    )
-    return path
 
 
 class _Run:
@@ -223,16 +211,16 @@ def _missing_for_convergence(found: FrameTimePosterior, lengths: Float64[np.ndar
 
 def _open_draws(path: Path, fingerprint: str) -> None:
     """Create a file of draws, or check that an existing one is of the run with this fingerprint."""
-    _check_space(path, 0)
     existed = path.exists()
     try:
+        _check_space(path, 0)
         with import_optional("h5py", "uncertainty").File(path, "a") as file:
             found = file.attrs.setdefault("fingerprint", "" if existed else fingerprint)
     except OSError as error:
-        if error.errno is not None and error.errno != errno.EINVAL:
+        if error.errno == errno.ENOSPC:
             raise
-        cure = "Remove it, or choose another."
-        raise invalid("backend", expected="a file of draws, or none yet", got=f"{path}, damaged", cure=cure) from error
+        got, cure = f"{path}, damaged or not to be written", "Remove it, or choose another, in a folder that exists."
+        raise invalid("backend", expected="a file of draws, or none yet", got=got, cure=cure) from error
     require(
         found == fingerprint,
         "backend",

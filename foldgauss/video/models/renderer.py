@@ -214,10 +214,11 @@ class VideoRenderer:
 
     def image(self, t: float) -> Float[np.ndarray, "channels height width"]:
         """The image at time t before rounding to 8 bits: planar float32, about [0, 1]."""
-        first, *others = (self._render(*part) for part in self._prepared.weighted_splats(t))
+        first, *others = (self.image_of(splats, weight) for weight, splats in self._prepared.weighted_splats(t))
         return sum(others, start=first)
 
-    def _render(self, weight: float, splats: Splats2D) -> Float[np.ndarray, "channels height width"]:
+    def image_of(self, splats: Splats2D, weight: float = 1.0) -> Float[np.ndarray, "channels height width"]:
+        """The image of these splats, as `image`, times a weight."""
         color = splats.color
         if len(self._background) > color.shape[-1]:
             color = np.pad(color, ((0, 0), (0, 1)), constant_values=1)  # alpha is the image of ones over zero
