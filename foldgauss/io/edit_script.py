@@ -363,7 +363,7 @@ def _check_keys(table: dict[str, Any], known: Collection[str], needed: Collectio
         require(key in table, "table", expected=f"the key {key!r}", got=", ".join(sorted(table)) or "an empty table")
     for key, value in table.items():
         kind = _KINDS.get(key, _NUMBERS)
-        require(kind.holds(value), key, expected=kind.expected, got=short_repr(value))
+        require(kind.holds(value), key, expected=kind.expected, got=_describe(value))
 
 
 def _check_known(key: str, expected: str, word: str, known: Collection[str]) -> None:
@@ -376,6 +376,14 @@ def _check_known(key: str, expected: str, word: str, known: Collection[str]) -> 
         got=short_repr(word),
         cure=f"Did you mean {near[0]!r}?" if near else "",
     )
+
+
+def _describe(value: Any) -> str:
+    """`short_repr`, also of what Python does not write: numbers of thousands of digits, and deep nesting."""
+    try:
+        return short_repr(value)
+    except (ValueError, RecursionError):
+        return "something else"
 
 
 def _check_selection(table: dict[str, Any], known: Collection[str]) -> None:
@@ -395,7 +403,7 @@ def _check_selection(table: dict[str, Any], known: Collection[str]) -> None:
 
 def _check_edit(table: dict[str, Any], selections: Collection[str]) -> None:
     do = table.get("do")
-    got = "none" if do is None else short_repr(do)
+    got = "none" if do is None else _describe(do)
     require(isinstance(do, str), "do", expected="one of " + ", ".join(ACTIONS), got=got)
     _check_known("do", "one of ", do, ACTIONS)
     _check_keys(table, ("do", "select", *ACTIONS[do].keys), ACTIONS[do].required)
