@@ -532,7 +532,11 @@ OTHERS = {
     "text": (lambda path: path.write_text("Dear diary,\n" * 40), "a text"),
     "audio": (lambda path: write_tone(path, 0.1), "audio"),
     "zip": (_zip, "a zip archive"),
-    "model": (lambda path: path.write_bytes(struct.pack("<Q", 2) + b"{}"), "a model"),
+    "model": (lambda path: path.write_bytes(struct.pack("<Q", 2) + b"{}"), "a model, which foldgauss render turns"),
+    "compact": (
+        lambda path: path.write_bytes(b"\x8bFGZ\r\n\x1a\n" + bytes(99)),
+        "a model, which foldgauss render turns",
+    ),
     "list": (lambda path: path.write_text("#EXTM3U\nother.ts\n"), "a list of other files"),
 }
 

@@ -124,9 +124,12 @@ def test_a_compact_file_needs_a_goal(clip, tmp_path):
         fit_job(job_of(clip, tmp_path, "model.fgz"))
 
 
-@pytest.mark.parametrize(("psnr", "num"), [(99.0, 1), (5.0, 0)])
-def test_a_psnr_out_of_reach_is_noted(clip, tmp_path, psnr, num):
-    job = job_of(clip, tmp_path, "model.fgz", config=dataclasses.replace(CONFIG, psnr=psnr))
+@pytest.mark.parametrize(
+    ("goals", "num"),
+    [({"psnr": 99.0}, 1), ({"psnr": 5.0}, 0), ({"psnr": 99.0, "size_mb": 1.0}, 1), ({"psnr": 99.0, "quality": 1.0}, 0)],
+)
+def test_a_psnr_out_of_reach_is_noted(clip, tmp_path, goals, num):
+    job = job_of(clip, tmp_path, "model.fgz", config=dataclasses.replace(CONFIG, **goals))
     told = [text for text in fit_job(job)["warnings"] if text.startswith("--psnr: expected 99 dB, got ")]
     assert len(told) == num
 

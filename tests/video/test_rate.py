@@ -513,7 +513,7 @@ def test_a_size_with_room_for_all_drops_none():
 @pytest.mark.parametrize("given", [{"psnr": 30.0}, {"steps": 5}, {"minutes": 1.0}], ids=str)
 def test_what_needs_a_clip_is_refused_without_one(fitted, given):
     (name,) = given
-    with pytest.raises(ValueError, match=f"{name}: expected None without the clip.*Give the clip's frames"):
+    with pytest.raises(ValueError, match=f"{name}: expected none without the clip.*Give the clip, too"):
         compress(fitted, **given)
 
 

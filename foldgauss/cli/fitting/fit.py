@@ -176,6 +176,8 @@ def fit_with_progress(
     @contextmanager
     def observe(clip: Clip, state: FitState | None) -> Iterator[Observer]:
         _print_plan(clip, job.config, display)
+        if state is not None:
+            err.print(f"Continues {job.checkpoint} after {state.step:,} steps.", soft_wrap=True)
         recorded = None
         if history is not None:
             recorded = HistoryFile(history) if state is None else HistoryFile(history, state.step, running_psnr(state))

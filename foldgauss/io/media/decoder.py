@@ -69,6 +69,7 @@ _KINDS = {
     b"PK\x03\x04": "a zip archive",
     b"\x1f\x8b": "a gzip archive",
     b"%PDF": "a PDF",
+    b"\x8bFGZ": "a model, which foldgauss render turns into a video",
     b"\x89HDF": "an HDF5 file",
     b"ply\n": "a PLY file",
     b"ID3": "audio",
@@ -535,5 +536,5 @@ def describe_kind(head: bytes) -> str | None:
     if found or is_wave or (head[4:8] == b"ftyp" and b"soun" in head and b"vide" not in head):
         return found or "audio"
     if head[8:9] == b"{" and int.from_bytes(head[:8], "little") < 100_000_000:
-        return "a .safetensors file, probably a model"
+        return "a .safetensors file, probably a model, which foldgauss render turns into a video"
     return "a text" if head and not any(byte < 9 or 13 < byte < 32 for byte in head[:4096]) else None

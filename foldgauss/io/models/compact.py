@@ -275,7 +275,7 @@ def _decode(path: Path, header: dict, data: bytes, visible: tuple[float, float])
                 continue
         streams = _read_streams(data, own, start)
         if streams is None:
-            missing.append(own["num_gaussians"])
+            missing.append(own)
         else:
             chunks.append(_decode_chunk(streams, rules, info, own))
     lost = _describe_missing(header["chunks"], missing)
@@ -284,11 +284,12 @@ def _decode(path: Path, header: dict, data: bytes, visible: tuple[float, float])
     return Quantized(info, rules, tuple(chunks), intervals, **paths), note
 
 
-def _describe_missing(chunks: list[dict], missing: list[int]) -> str:
-    """`missing`: the numbers of Gaussians of the chunks that cannot be read."""
-    total = sum(own["num_gaussians"] for own in chunks)
+def _describe_missing(chunks: list[dict], missing: list[dict]) -> str:
+    """`missing`: the chunks that cannot be read."""
+    num, total = (sum(own["num_gaussians"] for own in some) for some in (missing, chunks))
     how = f"{len(missing)} of its {len(chunks)} chunks {'is' if len(missing) == 1 else 'are'} cut off or damaged"
-    return f"{how}; {sum(missing):,} of {total:,} Gaussians are missing"
+    first = ", among them the largest" if missing and missing[0] is chunks[0] else ""
+    return f"{how}; {num:,} of {total:,} Gaussians are missing{first}"
 
 
 def _check_blocks(header: dict, info: CompactInfo) -> None:

@@ -65,7 +65,7 @@ def compress(
     )
     if frames is None:
         for name, value in (("psnr", psnr), ("steps", steps), ("minutes", minutes)):
-            require(value is None, name, expected="None without the clip", got=value, cure="Give the clip's frames.")
+            require(value is None, name, expected="none without the clip", got=value, cure="Give the clip, too.")
         return _round_only(model, config)
     check_frames_of(model, frames)
     check_frames(frames)

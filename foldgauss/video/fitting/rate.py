@@ -375,7 +375,7 @@ class RateControl(DensityControl):
         elif not (state.rules or _is_given(state)):
             last, after = state.last_drop or (exact, exact)
             replaced = min(last - after, exact - last)
-            risk = daring * min(max(_RISK_GROWTH * replaced, _FIRST_RISKED_DB), _MOST_RISKED_DB)
+            risk = adaptation * daring * min(max(_RISK_GROWTH * replaced, _FIRST_RISKED_DB), _MOST_RISKED_DB)
             risked = lambda coarseness: cost(coarseness) <= risk  # noqa: E731
             low = _last(risked, low, self._usual_coarseness(state, measured, action))
         return max(low, _last(reaches, low, high))
