@@ -5,6 +5,7 @@ import http.client
 import json
 import os
 import re
+import secrets
 import shutil
 import signal
 import subprocess
@@ -117,7 +118,7 @@ SCRIPT = '[selections.it]\nindices = "0-3"\n\n[[edits]]\nselect = "it"\ndo = "va
 
 
 def test_the_server_saves_the_script_of_its_page(tmp_path):
-    script, token = tmp_path / "clip.edit.toml", page_server.make_token()
+    script, token = tmp_path / "clip.edit.toml", secrets.token_urlsafe(32)
     with serving(script=script, token=token) as (_, ask):
         version = '"none"'
         for text in (SCRIPT, SCRIPT.replace("0-3", "5")):
@@ -138,7 +139,7 @@ def test_the_server_saves_the_script_of_its_page(tmp_path):
 def test_requests_that_are_not_the_pages_save_nothing(tmp_path, monkeypatch):
     folder = tmp_path / "models"
     folder.mkdir()
-    script, token = folder / "clip.edit.toml", page_server.make_token()
+    script, token = folder / "clip.edit.toml", secrets.token_urlsafe(32)
     monkeypatch.setattr(page_server, "MAX_BYTES", 1000)
     with serving(script=script, token=token) as (server, ask):
         port, good = server.server_address[1], {"X_Foldgauss_Token": token, "If_Match": '"none"'}
@@ -147,7 +148,7 @@ def test_requests_that_are_not_the_pages_save_nothing(tmp_path, monkeypatch):
             (403, {"X_Foldgauss_Token": ""}),
             (403, {"X_Foldgauss_Token": token[:-1]}),
             (403, {"X_Foldgauss_Token": "\xe9" * 43}),
-            (403, {"X_Foldgauss_Token": page_server.make_token()}),
+            (403, {"X_Foldgauss_Token": secrets.token_urlsafe(32)}),
             (403, good | {"Host": "evil.example"}),
             (403, good | {"Host": f"evil.example:{port}"}),
             (403, good | {"Host": f"127.0.0.1:{port + 1}"}),
@@ -178,8 +179,6 @@ def test_requests_that_are_not_the_pages_save_nothing(tmp_path, monkeypatch):
         "models",
         "models/clip.edit.toml",
     ]
-    assert page_server.make_token() != token
-    assert len(token) >= 43
 
 
 def test_view_saves_beside_the_model(served, work, tmp_path):

@@ -314,6 +314,7 @@ def test_degenerate_data_give_finite_parameters():
         ("devices", np.zeros((5, 3)), {"devices": 1000}),
         ("start", _blobs(), {"start": "here"}),
         ("start", _blobs(), {"start": _start(np.zeros((K, 2)), np.tile(np.eye(2), (K, 1, 1)))}),
+        ("start", np.add(_blobs(), [0, 0, 1e9]), {"start": _start(np.zeros((K, 3)), np.tile(np.eye(3), (K, 1, 1)))}),
         ("start", _blobs(), {"n_components": 2, "start": _start(np.zeros((K, 3)), np.tile(np.eye(3), (K, 1, 1)))}),
         ("start", _blobs(), {"degree": 0, "start": _start(np.zeros((1, 3)), np.eye(3)[None], [1.0])}),
         ("verbose", np.zeros((5, 3)), {"verbose": -1}),

@@ -413,7 +413,7 @@ def test_sigterm_to_a_run_of_draws_keeps_them(work, tmp_path, monkeypatch, capsy
     monkeypatch.setattr(HDFBackend, "save_step", kept)
     words = ["uncertainty", work / "model.safetensors", work / "clip.mp4", "--out", tmp_path, "--steps", "600"]
     assert run(*words) == 143
-    assert "the same command continues from" in " ".join(capsys.readouterr().err.split())
+    assert "Give the same command again to continue" in " ".join(capsys.readouterr().err.split())
     assert sorted(os.listdir(tmp_path)) == ["chains.h5"]
 
 

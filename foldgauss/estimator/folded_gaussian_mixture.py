@@ -17,7 +17,7 @@ from sklearn.utils import check_random_state
 from sklearn.utils._param_validation import Interval, StrOptions
 from sklearn.utils.validation import _check_sample_weight, check_is_fitted, validate_data
 
-from foldgauss._runtime.checks import is_integer, require
+from foldgauss._runtime.checks import is_integer, require, short_repr
 from foldgauss.envelope import Constant, TimeLikelihood
 from foldgauss.estimator.chunks import is_chunked, open_chunks, summarize_rows
 from foldgauss.estimator.em.components import Parameters
@@ -60,6 +60,9 @@ _CURES = {
     EMStatus.SINGULAR: "A component's points lie on its curve, at one time, or in a plane: raise reg_covar, or lower "
     "n_components or degree.",
 }
+#: Distance of the times of a start from the mean of the data, in standard deviations of their times, above which it is
+#: refused if all components are so far.
+_FARTHEST_START = 100.0
 #: With "auto", the initial number of components is at most the number of points divided by this.
 _POINTS_PER_COMPONENT = 8
 
@@ -313,6 +316,13 @@ class FoldedGaussianMixture(ClassNamePrefixFeaturesOutMixin, TransformerMixin, D
         """Initial parameters, with a leading axis of `n_init`."""
         if self.start is not None:
             start = from_mixture(self.start, data.scaling, degree, data.dtype)
+            require(
+                np.abs(start.time_loc).min() <= _FARTHEST_START,
+                "start",
+                expected="times like those of X",
+                got=f"others, {short_repr(np.asarray(self.start.components.time_loc))}",
+                cure="`to_mixture()` without time_origin has such times, with float64 enabled where they are large.",
+            )
             return jax.tree.map(lambda z: z[None], restrict_covariances(start, self.covariance_type))
         rng = check_random_state(self.random_state)
         made, whole = [], None

@@ -33,7 +33,7 @@ def check_start(start, n_components, degree: int, num_columns: int) -> None:
         and isinstance(start.components.fold, PolynomialFold),
         "start",
         expected="one FoldedMixture with polynomial folds",
-        got=type(start).__name__,
+        got=short_repr(start),
         cure="Such as `to_mixture()` of an earlier fit.",
     )
     num, dim, own = start.num_components, start.event_shape[0], start.components.fold.degree

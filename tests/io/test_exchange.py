@@ -15,6 +15,7 @@ from foldgauss.io import (
     write_3dgs_frames,
     write_3dgs_ply,
     write_pseudomesh,
+    write_vegas_segments,
     write_video,
 )
 from foldgauss.io.page.player_page import quantize_finely
@@ -75,6 +76,10 @@ SWAPPED = {
         r"model: expected a VideoModel, .* got Edit\. End the chain with \.video\(\)",
     ),
     "load": (lambda m, s, p: load_video_model(m), "path: expected a path, got VideoModel"),
+    "segments of one model": (
+        lambda m, s, p: write_vegas_segments(p, m),
+        "video: expected a SegmentedVideo, got VideoModel",
+    ),
     "no times": (lambda m, s, p: write_3dgs_frames(p, m, "x"), "times: expected one or more numbers"),
     "times of frames": (lambda m, s, p: write_pseudomesh(p, m, [0, 3]), "times: expected one or more numbers"),
     "masks": (

@@ -216,6 +216,21 @@ def test_sound_that_is_longer_than_the_picture_is_no_damage(tmp_path, name):
     assert clip.notes == ()
 
 
+def test_a_picture_that_ends_in_the_middle_of_its_sound_is_noted(tmp_path):
+    """Packets of 188 bytes of a transport stream, whose later ones of the picture become padding."""
+    sound, context = ("mp2", np.zeros(4 * 48_000)), {"bit_rate": 800_000}
+    how = {"given": "rgb24", "context": context, "rate": 25, "sound": sound}
+    path = encode(tmp_path / "a.ts", noise(100), "mpeg2video", "yuv420p", **how)
+    packets = np.frombuffer(path.read_bytes(), np.uint8).reshape(-1, 188).copy()
+    numbers = (packets[:, 1] & 31).astype(int) * 256 + packets[:, 2]
+    picture = (numbers == np.bincount(numbers).argmax()) & (np.arange(len(packets)) > 0.45 * len(packets))
+    packets[picture, 1:3] = 0x1F, 0xFF
+    path.write_bytes(packets.tobytes())
+    clip = read_video(path)
+    assert clip.num_frames < 60
+    assert any(note.endswith("of the file hold no frame that decodes.") for note in clip.notes)
+
+
 def test_a_declared_size_that_cannot_be_converted_to_is_an_error(video):
     """Found by fuzzing a header: FFmpeg's conversion refuses to stretch so much."""
     video.stored_size = 63693, 2782

@@ -122,7 +122,7 @@ def test_files_of_edited_videos_and_segments(tmp_path):
 def test_frames_for_other_programs_are_those_of_the_model(tmp_path):
     video = edit(MODEL).select(OBJECT).move((0.1, 0)).video()
     mesh = read_pseudomesh(write_pseudomesh(tmp_path / "mesh", video, [0.3]))
-    np.testing.assert_allclose(mesh.frame(0), VideoRenderer(video).frame(0.3), atol=1)
+    np.testing.assert_allclose(next(mesh.frames()), VideoRenderer(video).frame(0.3), atol=1)
     seen = project(frame_gaussians(video, 0.3), Camera.front(SIZE[0] / SIZE[1]), SIZE)
     np.testing.assert_allclose(seen.mean, VideoRenderer(video).splats(0.3).mean, atol=1e-3)
 

@@ -274,6 +274,11 @@ def test_a_psnr_is_that_over_any_background():
     assert over_white(fit(frames, dataclasses.replace(config, psnr=35.0)).model, frames) > whole - 2
 
 
+def test_a_fit_that_ends_before_its_first_action_is_rounded():
+    config = dataclasses.replace(CONFIG, steps=None, minutes=1e-5, quality=None, psnr=20.0)
+    assert fit(FRAMES, config).quantized.num_gaussians > 0
+
+
 def test_the_smallest_of_two_goals_wins(by_quality):
     """A low quality with much room, and a high one with little."""
     roomy = fit(FRAMES, dataclasses.replace(CONFIG, quality=30, size_mb=1.0))

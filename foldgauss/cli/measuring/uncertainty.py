@@ -12,6 +12,7 @@ from foldgauss._runtime.checks import ParameterError, check_one_of, invalid, req
 from foldgauss._runtime.optional_imports import import_optional
 from foldgauss.cli.app.application import Stopped, command, out, warn
 from foldgauss.cli.app.help import complete_choice
+from foldgauss.cli.fitting.job_progress import describe_continuation
 from foldgauss.cli.shared.arguments import FittedClip, FittedFrames, ModelFile, Overwrite
 from foldgauss.cli.shared.console import choose_display, show_progress
 from foldgauss.cli.shared.files import (
@@ -131,7 +132,7 @@ def uncertainty_command(
         settings = {"concentration": concentration, "ensembles": ensembles, "steps": steps, "seed": seed}
         if overwrite:
             (out_dir / CHAINS).unlink(missing_ok=True)
-        posterior = _sample(out_dir / CHAINS, show, profiles=profiles, **settings)
+        posterior = _sample(out_dir / CHAINS, show, overwrite, profiles=profiles, **settings)
     fitted = np.asarray(model.frame_times.times(), np.float64) if model.num_frames == clip.num_frames else None
     title = f"{model_path.name}, by {Path(clip.source).name}"
     written = write_or_keep(out_dir, lambda folder: _write(folder, posterior, fitted, title))
@@ -140,7 +141,7 @@ def uncertainty_command(
         warn(f"{posterior.message} The draws so far are in {written}.")
 
 
-def _sample(path: Path, show: Callable, **arguments: Any) -> FrameTimePosterior:
+def _sample(path: Path, show: Callable, overwrite: bool, **arguments: Any) -> FrameTimePosterior:
     """Sample, from the draws of a stopped run if there are any."""
     existed, sampled = path.exists(), False
 
@@ -162,7 +163,7 @@ def _sample(path: Path, show: Callable, **arguments: Any) -> FrameTimePosterior:
             cure="Choose another folder, or add --overwrite.",
         ) from error
     except KeyboardInterrupt as error:
-        raise Stopped(f"stopped; the same command continues from {path}.") from error
+        raise Stopped(f"stopped; the draws are in {path}. {describe_continuation(overwrite)}") from error
     if existed:
         text = "was complete: nothing was sampled" if not sampled else "was continued"
         out.print(f"{path}: {text}", soft_wrap=True)

@@ -151,6 +151,7 @@ def write_vegas_segments(folder: PathLike, video: SegmentedVideo, *, overwrite: 
     holds anything but segments. Raises as `write_vegas_ply`; `OutputError` where the folder is refused.
     """
     folder = Path(folder)
+    require(isinstance(video, SegmentedVideo), "video", expected="a SegmentedVideo", got=type(video).__name__)
     with atomic_folder(folder, overwrite, pattern=r"segment-[0-9]{3,}\.ply", what="segments") as temporary:
         for number, segment in enumerate(video.segments):
             write_vegas_ply(temporary / f"segment-{number:03d}.ply", segment.model)

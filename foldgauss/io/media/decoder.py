@@ -50,7 +50,6 @@ CONVERSION = (
 _UNSPECIFIED = 2  # FFmpeg's number of a matrix that is not declared
 #: FFmpeg's decoders of VP8 and VP9 drop alpha; these are the ones that keep it.
 _ALPHA_DECODERS = {"vp8": "libvpx", "vp9": "libvpx-vp9"}
-
 #: Fraction of a file after its last frame or sound that decodes, above which it is reported.
 MAX_UNREAD = 0.2
 
@@ -116,7 +115,8 @@ class VideoDecoder:
         self._angle: int | None = None  # of the display matrix
         self._matrix = 1 << 16, 0, 0, 1 << 16  # right is shown along the first two, down along the others
         self._stamp = -1  # of the frame decoded last from an AVI
-        self.read_bytes = 0  # up to the end of the last packet that decodes, or of another stream
+        self.read_bytes = 0  # up to the end of the last packet that decodes
+        self.others: list[tuple[int, int]] = []  # after it, place and size of packets of other streams, such as sound
         self.is_damaged = False  # whether data did not decode, or decoded with errors, since the frame before
 
     def close(self) -> None:
@@ -297,23 +297,22 @@ class VideoDecoder:
             except av.FFmpegError:
                 self.is_damaged = True
                 continue
-            self._count_bytes(packet)
+            if packet is not None:
+                self.read_bytes = max(self.read_bytes, (packet.pos or 0) + packet.size)
+                self.others = [other for other in self.others if other[0] > self.read_bytes]
             yield from map(self._set_time, found)
             if packet is None:
                 return
 
-    def _count_bytes(self, packet: av.Packet | None) -> None:
-        if packet is not None:
-            self.read_bytes = max(self.read_bytes, (packet.pos or 0) + packet.size)
-
     def _read_packets(self) -> Iterator[av.Packet]:
         """The packets of the stream, of which those that cannot be read are left out."""
-        num_errors, before = 0, (self._stream.start_time or 0) - 1
+        num_errors, before, place = 0, (self._stream.start_time or 0) - 1, 0
         while num_errors < MAX_ERRORS:
             try:
                 for packet in self._container.demux():
                     if packet.stream_index != self._stream.index:
-                        self._count_bytes(packet)
+                        place = packet.pos or place  # several packets may stand at one place
+                        self.others.append((place, packet.size))
                         continue
                     self.is_damaged |= packet.is_corrupt
                     if packet.size:
@@ -419,7 +418,7 @@ def scan_video(
         num_total = decoder.count_declared(seconds, fps, max(end - seconds[-1], 0.0), is_damaged=bool(damaged))
         notes = _describe_video(decoder, sorted(transfers - {None})) if len(kept) else []
         is_whole = not following and not decoder.num_declared and decoder.declared_seconds is None
-        unread = 1 - decoder.read_bytes / path.stat().st_size
+        unread = 1 - (decoder.read_bytes + sum(size for _, size in decoder.others)) / path.stat().st_size
         if is_whole and decoder.read_bytes and unread > MAX_UNREAD:
             notes.append(f"the last {unread:.0%} of the file hold no frame that decodes.")
     # The container's count may be an estimate, so the range is checked against the decoded frames as well.

@@ -1,11 +1,14 @@
 """Random access to the frames of a clip, equal to the bit to sequential reading: an index made in one pass, by which
 any span is decoded without starting at the first frame, and an array of frames that are decoded on access."""
 
+import ctypes
+import gc
 import hashlib
 import json
 import operator
 import os
 import threading
+import weakref
 from collections.abc import Callable, Iterator
 from contextlib import closing
 from pathlib import Path
@@ -14,7 +17,7 @@ import cv2
 import numpy as np
 from jaxtyping import UInt8
 
-from foldgauss._runtime.checks import require, short_repr
+from foldgauss._runtime.checks import short_repr
 from foldgauss.io._atomic import PathLike, atomic_path, check_path
 from foldgauss.io.media.clip import (
     Clip,
@@ -203,6 +206,21 @@ def read_indexed(
     return Clip(frames, float(rate.fps), *about)
 
 
+_ALIVE: weakref.WeakSet["LazyFrames"] = weakref.WeakSet()
+
+
+def _begin_child() -> None:
+    """In a forked process never free the parent's decoders, which would wait for threads that a fork does not copy."""
+    gc.freeze()
+    for frames in list(_ALIVE):
+        ctypes.pythonapi.Py_IncRef(ctypes.py_object(frames._decoder))
+        frames._open()
+
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_begin_child)
+
+
 class LazyFrames:
     """The frames of an indexed clip as an array that is decoded on access.
 
@@ -210,9 +228,9 @@ class LazyFrames:
     `read_video(path, size=size).frames`, from `first` up to `stop`.
 
     `frames[k]` and `frames[a:b]` return C-contiguous copies. Forward access decodes each frame about once; some frames
-    are cached for access to single ones. The object can be pickled, and read by several threads. A forked process has
-    no copy of the decoder's threads, and raises `VideoError`. The file stays open until `close()` or until the object
-    is deleted. Reading raises what `read_indexed` does.
+    are cached for access to single ones. The object can be pickled, and read by several threads. A forked process opens
+    the file anew; spawned ones are safer, since a fork copies no threads. The file stays open until `close()` or until
+    the object is deleted. Reading raises what `read_indexed` does.
     """
 
     dtype, ndim = np.dtype(np.uint8), 4
@@ -221,7 +239,10 @@ class LazyFrames:
         self._first, self._stop = index.check_frames(first, stop)
         self.index, self._size = index, check_frame_size(size)
         self.shape = self._stop - self._first, *(self._size or index.size), 4 if index.has_alpha else 3
-        self._process = os.getpid()
+        self._open()
+        _ALIVE.add(self)
+
+    def _open(self) -> None:
         self._decoder: VideoDecoder | None = None
         self._frames: Iterator = iter(())
         self._last: int | None = None  # number of the frame decoded last, among all frames of the file; None: unknown
@@ -243,14 +264,6 @@ class LazyFrames:
         return self.shape[0]
 
     def __getitem__(self, which: int | slice) -> np.ndarray:
-        require(
-            os.getpid() == self._process,
-            "frames[...]",
-            expected="the process that opened the clip",
-            got="one forked from it",
-            cure="Start processes with spawn.",
-            kind=VideoError,
-        )
         if isinstance(which, slice):
             chosen = range(len(self))[which]
             if chosen and chosen.step == 1:

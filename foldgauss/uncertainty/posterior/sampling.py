@@ -217,7 +217,7 @@ def _open_draws(path: Path, fingerprint: str) -> None:
         with import_optional("h5py", "uncertainty").File(path, "a") as file:
             found = file.attrs.setdefault("fingerprint", "" if existed else fingerprint)
     except OSError as error:
-        if error.errno == errno.ENOSPC:
+        if error.errno in (errno.ENOSPC, errno.EAGAIN, errno.EACCES):  # a full disk; a file that is open elsewhere
             raise
         got, cure = f"{path}, damaged or not to be written", "Remove it, or choose another, in a folder that exists."
         raise invalid("backend", expected="a file of draws, or none yet", got=got, cure=cure) from error

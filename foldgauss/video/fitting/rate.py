@@ -372,7 +372,7 @@ class RateControl(DensityControl):
         low, high = FINEST, COARSEST
         if not drops and state.coarseness:
             low, high = state.coarseness - _FINER_ROUNDING, state.coarseness
-        elif not (state.rules or _is_given(state)):
+        elif drops and not (state.rules or _is_given(state)):
             last, after = state.last_drop or (exact, exact)
             replaced = min(last - after, exact - last)
             risk = adaptation * daring * min(max(_RISK_GROWTH * replaced, _FIRST_RISKED_DB), _MOST_RISKED_DB)
