@@ -523,7 +523,8 @@ def test_nan_asked_of_time_is_nan_answered():
 
 def test_weights_that_jax_takes_for_zero_are_refused():
     components = FoldedGaussian([[0.0], [1.0]], scale=[[1.0], [1.0]], time_loc=[0.4, 0.6], time_scale=[0.2, 0.2])
-    with pytest.raises(ValueError, match=r"weights: expected a weight of at least 1\.17549e-38, got .*divide by"):
+    told = r"weights: expected a positive weight, of at least 1\.17549e-38, got .*divide by"
+    with pytest.raises(ValueError, match=told):
         FoldedMixture(components, weights=[1e-40, 1e-42])
     assert jnp.isfinite(FoldedMixture(components, weights=[1e-30, 1e-42]).log_prob([0.5, 0.5]))
 

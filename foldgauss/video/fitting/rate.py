@@ -88,6 +88,8 @@ _SAMPLED_FRAMES = 12
 #: By how much steps of rounding for a PSNR are finer at most, as a binary logarithm, than those that Gaussians were
 #: dropped by. A quality has the same for both.
 _FINER_ROUNDING = 0.5
+#: How many dB rounding for a PSNR may cost at once.
+_MOST_ROUNDED_DB = 1.0
 #: How many dB dropping for a PSNR may cost before the rest of the fit makes up for it, where that reaches the PSNR and
 #: the fit has made up for all of the last dropping.
 _MOST_DROPPED_DB = 6.0
@@ -367,7 +369,7 @@ class RateControl(DensityControl):
             if drops and not state.rules:
                 num_values = measured.are_worth(coarseness).sum() * len(column_names(self.config.fold_degree))
                 error += _LEFT_OF_ROUNDING * num_values * 4.0**coarseness / 12 / self._error_at_0_db(state)
-            return -10 * math.log10(error) >= aim and not (drops and db > daring * _MOST_DROPPED_DB)
+            return -10 * math.log10(error) >= aim and db <= (daring * _MOST_DROPPED_DB if drops else _MOST_ROUNDED_DB)
 
         low, high = FINEST, COARSEST
         if not drops and state.coarseness:
