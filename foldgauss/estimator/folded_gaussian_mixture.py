@@ -72,8 +72,8 @@ class FoldedGaussianMixture(ClassNamePrefixFeaturesOutMixin, TransformerMixin, D
 
         p(x) = sum_k w_k N(t | m_k, sigma_k^2) N(s | loc_k + f_k(m_k - t), a_k(t) Sigma_k),   x = (s, t)
 
-    Parameters and fitted attributes are those of scikit-learn's GaussianMixture where they mean the same; `start` takes
-    the place of its initial values and of `warm_start`. With the default envelope a = 1, `degree=1` *is* its model with
+    Parameters and fitted attributes have the names of scikit-learn's GaussianMixture where they mean the same. `start`
+    replaces its initial values and `warm_start`. With the default envelope a = 1, `degree=1` *is* its model with
     `covariance_type="full"` and `degree=0` with `covariance_type="diag"` its "diag".
 
     **Data larger than memory:** in place of rows (n, d), X may be chunks of rows: an iterable of arrays (n_i, d) that

@@ -53,8 +53,8 @@ class FitJob:
     `clip` and `target` are paths that every worker can open; `size` is the (height, width) of the frames, or None;
     `frames` the range (first, stop) of the clip, or None. With `index`, the file of a `FrameIndex`, frames are found by
     seeking, and counted from the first one of the index. `fps` replaces the clip's frame rate. `source` identifies the
-    clip: results of another source are not reused. `metadata` is added to that of the model file. Checkpoint and record
-    are in `folder`, by default beside the model.
+    clip: results of another source are not reused. `metadata` is added to the metadata of the model file. Checkpoint
+    and record are in `folder`, by default beside the model.
     """
 
     name: str

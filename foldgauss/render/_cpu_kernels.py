@@ -424,7 +424,7 @@ def forward_rows(
     across = (width + TILE - 1) // TILE
     tile_start, listed = _bucket_tiles(geometry, row_start, entries, begin, end, height, width)
     entries = entries[row_start[begin] : row_start[end]]
-    num_stored = len(listed) // BLOCK if over else 0  # at most so many blocks are not the first of their tile
+    num_stored = len(listed) // BLOCK if over else 0  # an upper limit: the first block of each tile is not stored
     used = np.empty(len(tile_start) - 1, np.int64)
     block_transmittances = np.empty((num_stored, PIXELS), np.float32)
     scratch, block = _aligned_empty((1 + len(background)) * PIXELS), _aligned_empty((_COLOR + len(background)) * BLOCK)

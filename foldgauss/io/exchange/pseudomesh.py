@@ -167,8 +167,8 @@ def read_pseudomesh(folder: PathLike, *, size: Size | None = None, fps: float | 
 
     Every `NAME.obj` of the folder, in natural order, with `NAME.ply` beside it: shape from the one, opacity and color
     from the other, face k being Gaussian k. `size` = (height, width), `fps` and the times come from pseudomesh.json;
-    without that file `size` must be given, the rate is 25 and the frames are evenly spaced. The axes of the `.obj` are
-    those of `write_pseudomesh`.
+    without that file `size` must be given, the rate is 25 and the frames are evenly spaced. The `.obj` has the
+    same axes as `write_pseudomesh` writes.
 
     **Raises:** `FileNotFoundError`; `FormatError`, with the file and where it can the line, for a file that is damaged
     or incomplete, faces that are no triangles or have no area, and vertices that a tool merged, split or reordered.

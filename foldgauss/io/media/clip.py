@@ -214,8 +214,8 @@ class ClipFacts:
     declares, or a default; None where its frames have durations of their own. `num_total`: the number of frames that
     the clip declares. `stamps`: of all frames decoded, from the first of the file on, in units of `time_base` seconds.
     `end`: when the last of these ends, in seconds; 0 where that is unknown. `notes`: about the whole clip. `threads`:
-    of the decoder. `damaged`, `resized`: the numbers of frames at or before which data do not decode without errors,
-    and of those of another size than the video. `names`: of the images of a folder.
+    of the decoder. `damaged`: the numbers of frames at or before which data do not decode without errors. `resized`:
+    the numbers of frames whose size differs from the video's. `names`: file names of the images of a folder.
     """
 
     kind: Literal["video", "folder", "pictures"]

@@ -299,10 +299,10 @@ _MIN_PADDED_SIZE = 1024
 
 
 def call_padded(function: Callable[..., Any], *arrays: Float[np.ndarray, "num ..."]) -> Any:
-    """The rows that a compiled function makes of those of arrays, float32.
+    """Call a compiled function that maps rows of arrays to rows, float32.
 
-    Their number is padded to a power of two, so that compiled code is reused: by 0, or by unit matrices, which are
-    valid factors and triangles.
+    The number of rows is padded to a power of two, so that compiled code is reused: by 0, or by unit matrices, which
+    are valid factors and triangles.
     """
     num = len(arrays[0])
     size, padded = max(_MIN_PADDED_SIZE, 1 << (num - 1).bit_length()), []

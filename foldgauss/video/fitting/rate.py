@@ -133,7 +133,8 @@ class Action(NamedTuple):
 
     `extent`: the fraction of the price of a bit at which Gaussians are dropped, or of the Gaussians that are rounded.
     `gain`: how many dB the PSNR rises at most from then to the end of the fit, rounding included, if nothing is
-    dropped any more. It is expected to rise as much as it has from the middle of the last dropping, if that is less.
+    dropped any more. The expected rise is the present PSNR less the mean of the PSNRs before and after the last
+    dropping, if this is less.
     """
 
     progress: float

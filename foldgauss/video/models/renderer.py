@@ -38,7 +38,7 @@ class PreparedVideo:
     times: Float[np.ndarray, " frames"]
 
     def splats(self, t: float) -> Splats2D:
-        """The splats of time t, front to back; NumPy leaves. In a fade they are those of the larger weight."""
+        """The splats of time t, front to back; NumPy leaves. In a fade, the splats with the larger weight."""
         return max(self.weighted_splats(t), key=lambda part: part[0])[1]
 
     def weighted_splats(self, t: float) -> list[tuple[float, Splats2D]]:
