@@ -595,9 +595,9 @@ START_DENSITY = 0.012
 #: Growth of the binary logarithm of that number for each unit of quality.
 DENSITY_PER_QUALITY = 0.08
 #: The PSNR of usual clips at quality 50, in dB.
-PSNR_AT_50 = 33.0
+PSNR_AT_50 = 34.0
 #: Growth of the binary logarithm of that number for each dB of the PSNR that is asked for.
-DENSITY_PER_DB = 0.14
+DENSITY_PER_DB = 0.2
 #: Gaussians per pixel of a clip for each microsecond of x, see `default_num_gaussians`, with which a fit of a compact
 #: model starts at most: those that do not converge are not worth their bits.
 START_PER_TIME = 7e-4

@@ -75,36 +75,34 @@ _TRIES = 8
 _TOLERANCE_LOG2 = 0.02
 #: By how much the binary logarithm of a size falls for each unit of coarseness, as measured.
 _SLOPE_LOG2 = 0.8
-#: The least fraction of the error of dropping that is expected to remain after many passes.
-_LEFT_OF_DROPPING = 0.2
 #: By how many dB dropping has to worsen the images at once for what remains of it to be measured.
 _LEAST_MEASURED_DB = 0.05
-#: That of the error of rounding.
-_LEFT_OF_ROUNDING = 0.6
 #: How finely the coarseness is searched for a PSNR.
 _TOLERANCE = 0.1
 #: Frames that a PSNR is estimated by.
 _SAMPLED_FRAMES = 12
-#: By how much steps of rounding for a PSNR are finer at most, as a binary logarithm, than those that Gaussians were
-#: dropped by. A quality has the same for both.
-_FINER_ROUNDING = 0.5
+#: By how many dB the PSNR of a finished fit falls for each unit of coarseness: 1.3 to 2.5 in usual clips.
+_DB_PER_UNIT = 2.0
+#: How much finer the steps may become between two actions, as a binary logarithm.
+_MOST_FINER = 0.5
 #: How many dB rounding for a PSNR may cost at once.
 _MOST_ROUNDED_DB = 1.0
-#: How many dB dropping for a PSNR may cost before the rest of the fit makes up for it, where that reaches the PSNR and
-#: the fit has made up for all of the last dropping.
-_MOST_DROPPED_DB = 6.0
-#: The same where it is not known yet whether the fit reaches it, at first.
-_FIRST_RISKED_DB = 0.5
-#: Later it may cost this many times what the last dropping did, or what the PSNR has risen by since, if that is less.
-_RISK_GROWTH = 2.0
-#: At most.
-_MOST_RISKED_DB = 1.0
-#: About how many dB a finished model gains by further training.
-_GAIN_OF_GIVEN = 0.2
-#: Lambda R / D that a fit to a PSNR aims at: at least, at most, and for the root of the number of passes in between.
-_LEAST_COST = 0.7
-_MOST_COST = 1.5
-_COST_PER_ROOT = 0.1
+#: How many dB dropping for a PSNR may cost at once where the fit has made up for all of the last dropping.
+_MOST_DROPPED_DB = 4.5
+#: The same where nothing was dropped before.
+_FIRST_DROPPED_DB = 2.0
+#: How many dB it may cost before `_TRUSTED_FROM`, whatever the PSNR is.
+_RISKED_DB = 1.0
+#: The fraction of the plan from which on the PSNR alone tells how much may be dropped.
+_TRUSTED_FROM = 0.42
+#: The fraction of the gain of an action that is sure.
+_SURE = 0.2
+#: Lambda R / D of a dropping for a PSNR in usual fits of a quality, with the bits of all that are kept then, and by
+#: which power of the fraction of the price it changes.
+_USUAL_COST = 1.1
+_COST_POWER = -0.37
+#: Passes over the frames of usual fits; it falls with the root of them where there are fewer.
+_USUAL_PASSES = 200.0
 #: By how much more passes are left in a fit by minutes than its speed so far suggests: steps of fewer Gaussians, of
 #: which ever more are rounded, are faster.
 _SPEEDUP = 2.0
@@ -132,9 +130,8 @@ class Action(NamedTuple):
     """What is done after a fraction of the plan: "drop", "sort", "divide" into chunks, or the group of leaves to round.
 
     `extent`: the fraction of the price of a bit at which Gaussians are dropped, or of the Gaussians that are rounded.
-    `gain`: how many dB the PSNR rises at most from then to the end of the fit, rounding included, if nothing is
-    dropped any more. The expected rise is the present PSNR less the mean of the PSNRs before and after the last
-    dropping, if this is less.
+    `gain`: by how many dB at most the PSNR of the finished model is above the mean of those before and after a
+    dropping, in usual fits of a quality.
     """
 
     progress: float
@@ -144,15 +141,15 @@ class Action(NamedTuple):
 
 
 ACTIONS = (
-    Action(0.1, "drop", 0.04, 3.0),
-    Action(0.2, "drop", 0.16, 4.0),
-    Action(0.3, "drop", 0.36, 3.0),
-    Action(0.42, "drop", 0.64, 2.2),
-    Action(0.55, "drop", 1.0, 1.6),
+    Action(0.1, "drop", 0.04, 4.0),
+    Action(0.2, "drop", 0.16, 3.3),
+    Action(0.3, "drop", 0.36, 2.5),
+    Action(0.42, "drop", 0.64, 1.9),
+    Action(0.55, "drop", 1.0, 1.1),
     Action(0.55, "sort"),
-    Action(0.7, SHAPE, 0.4, 1.3),
+    Action(0.7, SHAPE, 0.4, 0.4),
     Action(0.78, SHAPE, 0.75),
-    Action(0.84, "drop", 1.0),
+    Action(0.84, "drop", 1.0, 0.2),
     Action(0.86, SHAPE, 1.0),
     Action(0.86, "divide"),  # when Gaussians are visible does not change from now on
     Action(0.91, TRAJECTORY, 0.5),
@@ -279,8 +276,8 @@ class RateControl(DensityControl):
         model = self._model(state)
         worth = Worth(model, self.background)
         coarseness = self._choose_coarseness(state, worth, action)
-        if not (state.rules or _is_given(state)):
-            state.coarseness = coarseness
+        if not state.rules:
+            state.coarseness = max(coarseness, state.coarseness - _MOST_FINER)
         kept = worth.are_worth(coarseness, action.extent)
         least = math.ceil(_LEAST_KEPT * len(kept))
         kept[np.argsort(worth.removal, kind="stable")[-least:]] = True
@@ -339,49 +336,42 @@ class RateControl(DensityControl):
         return _solve(excess, state.coarseness or USUAL_COARSENESS)
 
     def _solve_psnr(self, state: FitState, measured: Worth | Quantizer, action: Action) -> float:
-        """The coarseness for the PSNR that is asked for, by some frames without what is dropped, or rounded.
+        """The coarseness for the PSNR that is asked for.
 
-        The rest of the fit makes up for a part of the error that this adds, and reduces the other error.
+        Gaussians are dropped by what they are worth, as in usual fits, but no more than the highest `Action.gain`
+        makes up for, and no less than the lowest one does. Steps of rounding are about as coarse. No action may cost
+        more at once than the rest of the fit makes up for.
         """
-        aim = self.config.psnr + _MARGIN_DB
+        aim, drops = self.config.psnr + _MARGIN_DB, action.what == "drop"
         adaptation = self._adaptation(state, action)
-        drops = action.what == "drop"
-        exact = self._psnr(self._model(state), self.sampled)
-        gain = adaptation * _expected_gain(state, exact, action)
-        before = self._psnr(self._with_only(state, np.ones(state.num_gaussians, bool)), self.sampled)
-        still = 1 - adaptation * (1 - _LEFT_OF_ROUNDING)  # of the error of rounding, which `before` may have
-        left = _error_at(exact + gain) + still * (_error_at(before) - _error_at(exact))
-        not_replaced = _left_of_dropping(state, exact)
-        daring = (1 - not_replaced) ** 2
-        dropping = 1 - adaptation * (1 - max(not_replaced, _LEFT_OF_DROPPING))
-        remaining = dropping if drops else still
+        now = self._psnr(self._with_only(state, np.ones(state.num_gaussians, bool)), self.sampled)
 
-        def cost(coarseness: float) -> float:
-            """dB that the actions cost at once."""
-            if drops:
-                changed = self._with_only(state, measured.are_worth(coarseness, action.extent))
-            else:
-                changed = dequantize(measured.quantize(coarseness))
-            return before - self._psnr(changed, self.sampled)
+        def coarsest(most: float, low: float, high: float) -> float:
+            """The coarsest one at which the action costs at most so many dB at once, where all of it is made up for."""
+            least = min(now - adaptation * most, aim)
 
-        def reaches(coarseness: float) -> bool:
-            db = cost(coarseness)
-            error = left + remaining * max(_error_at(before - db) - _error_at(before), 0.0)
-            if drops and not state.rules:
-                num_values = measured.are_worth(coarseness).sum() * len(column_names(self.config.fold_degree))
-                error += _LEFT_OF_ROUNDING * num_values * 4.0**coarseness / 12 / self._error_at_0_db(state)
-            return -10 * math.log10(error) >= aim and db <= (daring * _MOST_DROPPED_DB if drops else _MOST_ROUNDED_DB)
+            def is_reached(coarseness: float) -> bool:
+                if drops:
+                    changed = self._with_only(state, measured.are_worth(coarseness, action.extent))
+                else:
+                    changed = dequantize(measured.quantize(coarseness))
+                return self._psnr(changed, self.sampled) >= least
 
-        low, high = FINEST, COARSEST
-        if not drops and state.coarseness:
-            low, high = state.coarseness - _FINER_ROUNDING, state.coarseness
-        elif drops and not (state.rules or _is_given(state)):
-            last, after = state.last_drop or (exact, exact)
-            replaced = min(last - after, exact - last)
-            risk = adaptation * daring * min(max(_RISK_GROWTH * replaced, _FIRST_RISKED_DB), _MOST_RISKED_DB)
-            risked = lambda coarseness: cost(coarseness) <= risk  # noqa: E731
-            low = _last(risked, low, self._usual_coarseness(state, measured, action))
-        return max(low, _last(reaches, low, high))
+            return _last(is_reached, low, max(low, min(high, COARSEST)))
+
+        if not drops:
+            low, high = FINEST, COARSEST
+            if state.coarseness:
+                low = max(state.coarseness - _MOST_FINER, FINEST)
+                high = state.coarseness + (now + action.gain - aim) / _DB_PER_UNIT
+            return coarsest(_MOST_ROUNDED_DB, low, high)
+        most = _most_dropped_db(state, now)
+        sure_gain = action.gain if state.rules else _SURE * action.gain
+        sure = coarsest(min(2 * (now + sure_gain - aim), most), FINEST, COARSEST)
+        if state.rules:
+            return sure
+        spare = max(2 * (now + action.gain - aim), _RISKED_DB if action.progress < _TRUSTED_FROM else 0.0)
+        return coarsest(min(spare, most), sure, self._usual_coarseness(state, measured, action))
 
     def _with_only(self, state: FitState, kept: Bool[np.ndarray, " num"]) -> VideoModel:
         """The model of some Gaussians, as rounded as it will be once the rules are chosen."""
@@ -392,16 +382,15 @@ class RateControl(DensityControl):
         return dequantize(quantize(select_rows(compute_columns(model), kept), classes, rules))
 
     def _usual_coarseness(self, state: FitState, worth: Worth, action: Action) -> float:
-        """The coarseness at which the bits of what is kept cost a usual part of the error that is asked for.
+        """The coarseness at which the bits of what is kept cost a usual multiple of the error that is asked for.
 
-        Where the error falls as a power of the bits, D ~ R^-b, the best file has lambda R = b D. b is larger where
-        there is time for many passes. More Gaussians would also leave fewer passes to a fit by minutes.
+        Where the error falls as a power of the bits, D ~ R^-b, the best file has lambda R = b D.
         """
         grid = np.arange(FINEST, COARSEST, _TOLERANCE)
         kept = [worth.are_worth(coarseness, action.extent).sum() for coarseness in grid]
         costs = [bit_price(coarseness) * USUAL_BITS * num for coarseness, num in zip(grid, kept, strict=True)]
-        part = min(max(_COST_PER_ROOT * math.sqrt(self._count_passes(state.plan)), _LEAST_COST), _MOST_COST)
-        limit = part * _error_at(self.config.psnr) * self._error_at_0_db(state)
+        part = _USUAL_COST * math.sqrt(min(self._count_passes(state.plan) / _USUAL_PASSES, 1.0))
+        limit = part * action.extent**_COST_POWER * _error_at(self.config.psnr) * self._error_at_0_db(state)
         return float(grid[np.argmax(np.minimum(costs, limit))])  # the first of enough, or the most
 
     def _error_at_0_db(self, state: FitState) -> float:
@@ -468,24 +457,13 @@ def _error_at(psnr: float) -> float:
     return 10 ** (-0.1 * psnr)
 
 
-def _left_of_dropping(state: FitState, psnr: float) -> float:
-    """The fraction of the error of dropping that remains, by the last dropping and the PSNR that it has led to."""
-    if not state.last_drop or state.last_drop[0] - state.last_drop[1] < _LEAST_MEASURED_DB:
-        return _LEFT_OF_DROPPING
-    before, after = map(_error_at, state.last_drop)
-    return min(max((_error_at(psnr) - before) / (after - before), 0.0), 1.0)
-
-
-def _expected_gain(state: FitState, psnr: float, action: Action) -> float:
-    """How many dB the PSNR rises until the end if nothing is dropped any more, see `Action`."""
-    if _is_given(state):
-        return _GAIN_OF_GIVEN
-    return min(action.gain, max(psnr - sum(state.last_drop) / 2, 0.0)) if state.last_drop else action.gain
-
-
-def _is_given(state: FitState) -> bool:
-    """Whether the fit began with a finished model; known until rules are chosen."""
-    return not state.coarseness and state.rate_actions > 0
+def _most_dropped_db(state: FitState, psnr: float) -> float:
+    """How many dB dropping may cost at once, by how much of the error of the last one remains at the present PSNR."""
+    if not state.last_drop:
+        return _FIRST_DROPPED_DB
+    before, after, now = map(_error_at, (*state.last_drop, psnr))
+    left = (now - before) / (after - before) if state.last_drop[0] - state.last_drop[1] >= _LEAST_MEASURED_DB else 0.0
+    return _MOST_DROPPED_DB * (1 - min(max(left, 0.0), 1.0)) ** 2
 
 
 def _decode_rules(state: FitState) -> dict[str, Rule]:
