@@ -95,14 +95,16 @@ _FIRST_DROPPED_DB = 2.0
 _RISKED_DB = 1.0
 #: The fraction of the plan from which on the PSNR alone tells how much may be dropped.
 _TRUSTED_FROM = 0.42
+#: Mean squared errors of a frame below this, in [0, 1], count as 0: its PSNR is at its maximum.
+_PERFECT = 1e-10
 #: The fraction of the gain of an action that is sure.
-_SURE = 0.2
+_SURE = 0.3
 #: Lambda R / D of a dropping for a PSNR in usual fits of a quality, with the bits of all that are kept then, and by
 #: which power of the fraction of the price it changes.
-_USUAL_COST = 1.1
+_USUAL_COST = 1.4
 _COST_POWER = -0.37
-#: Passes over the frames of usual fits; it falls with the root of them where there are fewer.
-_USUAL_PASSES = 200.0
+#: Passes over the frames of usual fits; it falls with them where there are fewer.
+_USUAL_PASSES = 70.0
 #: By how much more passes are left in a fit by minutes than its speed so far suggests: steps of fewer Gaussians, of
 #: which ever more are rounded, are faster.
 _SPEEDUP = 2.0
@@ -131,7 +133,7 @@ class Action(NamedTuple):
 
     `extent`: the fraction of the price of a bit at which Gaussians are dropped, or of the Gaussians that are rounded.
     `gain`: by how many dB at most the PSNR of the finished model is above the mean of those before and after a
-    dropping, in usual fits of a quality.
+    dropping, or above that before rounding, in usual fits of a quality.
     """
 
     progress: float
@@ -344,6 +346,7 @@ class RateControl(DensityControl):
         """
         aim, drops = self.config.psnr + _MARGIN_DB, action.what == "drop"
         adaptation = self._adaptation(state, action)
+        gain = action.gain * float((state.frame_errors > _PERFECT).mean())  # the PSNR of perfect frames does not rise
         now = self._psnr(self._with_only(state, np.ones(state.num_gaussians, bool)), self.sampled)
 
         def coarsest(most: float, low: float, high: float) -> float:
@@ -363,14 +366,14 @@ class RateControl(DensityControl):
             low, high = FINEST, COARSEST
             if state.coarseness:
                 low = max(state.coarseness - _MOST_FINER, FINEST)
-                high = state.coarseness + (now + action.gain - aim) / _DB_PER_UNIT
+                high = state.coarseness + (now + gain - aim) / _DB_PER_UNIT
             return coarsest(_MOST_ROUNDED_DB, low, high)
         most = _most_dropped_db(state, now)
-        sure_gain = action.gain if state.rules else _SURE * action.gain
+        sure_gain = gain if state.rules else _SURE * gain
         sure = coarsest(min(2 * (now + sure_gain - aim), most), FINEST, COARSEST)
         if state.rules:
             return sure
-        spare = max(2 * (now + action.gain - aim), _RISKED_DB if action.progress < _TRUSTED_FROM else 0.0)
+        spare = max(2 * (now + gain - aim), _RISKED_DB if action.progress < _TRUSTED_FROM else 0.0)
         return coarsest(min(spare, most), sure, self._usual_coarseness(state, measured, action))
 
     def _with_only(self, state: FitState, kept: Bool[np.ndarray, " num"]) -> VideoModel:
@@ -389,7 +392,7 @@ class RateControl(DensityControl):
         grid = np.arange(FINEST, COARSEST, _TOLERANCE)
         kept = [worth.are_worth(coarseness, action.extent).sum() for coarseness in grid]
         costs = [bit_price(coarseness) * USUAL_BITS * num for coarseness, num in zip(grid, kept, strict=True)]
-        part = _USUAL_COST * math.sqrt(min(self._count_passes(state.plan) / _USUAL_PASSES, 1.0))
+        part = _USUAL_COST * min(self._count_passes(state.plan) / _USUAL_PASSES, 1.0)
         limit = part * action.extent**_COST_POWER * _error_at(self.config.psnr) * self._error_at_0_db(state)
         return float(grid[np.argmax(np.minimum(costs, limit))])  # the first of enough, or the most
 
@@ -402,7 +405,7 @@ class RateControl(DensityControl):
         errors = state.frame_errors.astype(float)
         # After two passes, 0 is the error of a perfect frame; before, that of a frame which was not seen yet.
         is_seen = (errors != 0) | (state.step * self.config.views.batch_size >= 2 * len(errors))
-        seen = -10 * np.log10(np.maximum(errors[is_seen], 1e-10))
+        seen = -10 * np.log10(np.maximum(errors[is_seen], _PERFECT))
         return float(seen.mean()) if len(seen) else running_psnr(state)
 
     def _psnr(self, model: VideoModel, which: Int[np.ndarray, " some"]) -> float:
