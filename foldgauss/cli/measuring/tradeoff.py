@@ -72,6 +72,8 @@ def tradeoff_command(
     """
     chosen = tuple(AXES) if axes is None else check_axes([name.strip() for name in axes.split(",")])
     check_within("--minutes", minutes, "(0, inf)", "a number above 0")
+    num_fits = 1 + sum(not variant.played for axis in chosen for variant in AXES[axis])
+    base = Point("base", "", FitConfig(seed=seed, steps=steps, minutes=None if steps else minutes / num_fits))
     out_dir = name_after(video, "-tradeoff") if out_dir is None else out_dir
     path = out_dir / RECORD
     known = overwrite or path.exists()
@@ -101,8 +103,6 @@ def tradeoff_command(
                 file.unlink(missing_ok=True)
         return {one.job.name: one for one in run_jobs(jobs, "points", choose_display(), None, overwrite=overwrite)}
 
-    num_fits = 1 + sum(not variant.played for axis in chosen for variant in AXES[axis])
-    base = Point("base", "", FitConfig(seed=seed, steps=steps, minutes=None if steps else minutes / num_fits))
     done = fit_all([base])["base"]
     require(done.failure is None, "base", expected="a fit of the base", got=done.failure)
     numbers = {name: done.record[name] for name in ("num_gaussians", "steps")}
