@@ -1,6 +1,5 @@
 """The command as a user meets it: real files, exit codes, one-line errors, nothing half-written."""
 
-import dataclasses
 import itertools
 import json
 import re
@@ -334,9 +333,6 @@ OPTIONS = {
     ),
     "--steps 9 --ssim-fraction 0.3 --error-fraction 0.1": STANDARD.replace(
         **{"loss.ssim_fraction": 0.3, "views.error_fraction": 0.1}
-    ),
-    "--steps 9 --alpha-cutoff 0.01 --support-radius 2 --transmittance-stop 0.02": STANDARD.replace(
-        options=dataclasses.replace(STANDARD.options, alpha_cutoff=0.01, support_radius=2.0, transmittance_stop=0.02)
     ),
 }
 

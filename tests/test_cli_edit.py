@@ -2,7 +2,6 @@
 
 import json
 
-import cv2
 import numpy as np
 import pytest
 from commands import call, run, seconds_heard, write_tone
@@ -126,9 +125,3 @@ def test_export_and_import(work, tmp_path):
     assert (tmp_path / "one.ply").read_bytes().startswith(b"ply\n")
     call(*export, "obj", "--out", tmp_path / "mesh", "--times", "0:1:3", out=f"triangles (obj), 3{several[1:]}")
     assert len(list((tmp_path / "mesh").glob("*.obj"))) == 3
-    assert run("import", tmp_path / "mesh", "--out", tmp_path / "pictures") == 0
-    picture = cv2.imread(str(sorted((tmp_path / "pictures").iterdir())[1]))[..., ::-1]
-    own = next(soft_model().frames(np.array([0.5])))
-    assert np.abs(picture.astype(int) - own).max() <= 2
-    assert run("import", tmp_path / "mesh", "--out", tmp_path / "mesh.gif") == 0
-    assert read_video(tmp_path / "mesh.gif").num_frames == 3

@@ -15,7 +15,7 @@ from soft_models import soft_model
 
 from foldgauss.cli.app.application import app, load_commands
 from foldgauss.cli.app.registry import COMMANDS, EXAMPLES
-from foldgauss.io import save_video_model, write_pseudomesh, write_vegas_ply, write_video
+from foldgauss.io import save_video_model, write_vegas_ply, write_video
 
 #: Of a terminal; Typer's help and ours go by it.
 WIDTHS = (80, 160)
@@ -128,7 +128,6 @@ def work(tmp_path_factory):
     save_video_model(folder / "holiday.safetensors", model, metadata={"clip": "holiday.mp4"})
     save_video_model(folder / "beach.safetensors", model, metadata={"clip": "holiday.mp4"})
     write_vegas_ply(folder / "video.ply", model)
-    write_pseudomesh(folder / "mesh", model)
     (folder / "night.toml").write_text('[[edits]]\ndo = "recolor"\ngain = 0.5\n')
     return folder
 
@@ -155,7 +154,6 @@ def here(work, tmp_path, monkeypatch):
         ("render beach.safetensors --stabilize smooth", "beach.stable.mp4"),
         ("export beach.safetensors --format obj --times 0.5", "beach-obj"),
         ("import video.ply", "video.safetensors"),
-        ("import mesh", "mesh.mp4"),
     ],
 )
 def test_outputs_are_named_after_inputs(words, made, here):

@@ -25,7 +25,7 @@ def test_errors_carry_their_parameter_which_commands_name_as_typed():
     for field in dataclasses.fields(FitConfig):
         if option := setting_of(field).option.split("/")[0]:
             assert fit._name_as_typed(field.name) == option
-    known = {"video": "VIDEO", "RenderOptions.alpha_cutoff": "--alpha-cutoff", "--steps": "--steps", "path": None}
+    known = {"video": "VIDEO", "loss.ssim_fraction": "--ssim-fraction", "--steps": "--steps", "path": None}
     assert {name: fit._name_as_typed(name) for name in known} == known
 
 
@@ -108,6 +108,7 @@ def full(tmp_path, monkeypatch):
         yield tmp_path / "full"
 
 
+@pytest.mark.filterwarnings("default:.*of the removed area is shown by no frame")
 @pytest.mark.parametrize("name", WRITING)
 def test_a_result_for_a_full_disk_is_kept(name, work, full):
     mask, script = full.parent / "mask.png", full.parent / "s.toml"

@@ -187,7 +187,7 @@ WRONG = [
     (f"{RENDER} a.mp4 --sound tone.wav --speed -1", 2, "forwards"),
     *(
         (f"{words} --{option} -1", 2, f"--{option}: expected a number in")
-        for words in (FIT, f"{RENDER} x.mp4", "evaluate model.safetensors clip")
+        for words in (f"{RENDER} x.mp4", "evaluate model.safetensors clip")
         for option in ("alpha-cutoff", "support-radius", "transmittance-stop")
     ),
     # render --stabilize, render --plate

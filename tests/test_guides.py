@@ -145,8 +145,7 @@ FACTS = {
         "np.allclose(again.splats.loc, model.splats.loc, rtol=0, atol=1e-6)",
         "np.array_equal(loaded.splats.coefficients, model.splats.coefficients)",
         "len(gaussians.mean) > 10",
-        "vertices.shape[1:] == (3, 3)",
-        "{*files} == {'edited.webm', 'frames', 'loop.gif', 'mesh', 'middle.ply', 'pictures', 'video.ply', 'scenes',"
+        "{*files} == {'frames', 'loop.gif', 'mesh', 'middle.ply', 'pictures', 'video.ply', 'scenes',"
         " 'waves.safetensors', 'theirs.safetensors', 'holiday.safetensors', 'point_cloud.ply'}",
     ],
     "docs/mixture.md": [

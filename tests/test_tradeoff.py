@@ -3,7 +3,6 @@
 import json
 import math
 import os
-import shlex
 import signal
 import sys
 from pathlib import Path
@@ -19,21 +18,15 @@ from foldgauss.cli.measuring import tradeoff as command
 from foldgauss.io import load_video_model, read_video, write_video
 from foldgauss.io.models.video_model import read_metadata
 from foldgauss.jobs import runner
-from foldgauss.video import FitConfig, FitDiverged, evaluate, tradeoff
+from foldgauss.video import FitDiverged, evaluate, tradeoff
 from foldgauss.video.tradeoff import (
     AXES,
-    LEAST_STEPS,
-    Throughput,
     check_axes,
-    estimate_seconds,
-    estimate_steps,
     knee,
     pareto_front,
-    plan_points,
 )
 
 SIZE, FRAMES = (24, 32), 6
-BASE = FitConfig(num_gaussians=400, steps=1000)
 QUICK = ["--steps", "12"]
 
 
@@ -51,7 +44,6 @@ def quickly_looked():
     """Playback and the pace are timed in a hurry: nothing here depends on how well."""
     with pytest.MonkeyPatch.context() as patched:
         patched.setattr(tradeoff, "_ROUNDS", 2)
-        patched.setattr(command, "PILOT_STEPS", 4)
         yield
 
 
@@ -119,33 +111,6 @@ def test_knee(cost, quality, expected):
     assert knee([c**2 for c in cost], [2 * q for q in quality]) == expected
 
 
-@pytest.mark.parametrize(
-    ("where", "axis", "why"),
-    [
-        ({"has_alpha": True}, "compositing", "alpha"),
-        ({"num_frames": 3}, "batch", "3 frames"),
-    ],
-)
-def test_variants_that_do_not_apply_are_skipped(where, axis, why):
-    where = {"num_frames": FRAMES, "has_alpha": False} | where
-    made, left = plan_points(BASE, (axis,), where["num_frames"], has_alpha=where["has_alpha"])
-    assert {one.name.split()[0] for one in left} == {axis}
-    assert all(why in one.why for one in left)
-    assert len(made) + len(left) == 1 + len(AXES[axis])
-
-
-@pytest.mark.parametrize("seconds", [50.0, 200.0, 3600.0])
-def test_steps_fill_the_time(seconds):
-    made, _ = plan_points(BASE, tuple(AXES), 132)
-    pace = Throughput(start=0.5, step=0.03, evaluation=0.1)
-    steps = estimate_steps(seconds, made, pace)
-    assert estimate_seconds(made, steps, pace) <= seconds < estimate_seconds(made, steps + 1, pace)
-    # Points of the base's model cost no fit.
-    played = [point for point in made if point.played is None]
-    saved = estimate_seconds(made, steps, pace) - estimate_seconds(played, steps, pace)
-    assert saved == pytest.approx((len(made) - len(played)) * pace.evaluation)
-
-
 def test_axes_by_name():
     assert check_axes(["power", "time"]) == ("time", "power")
     for wrong in (["speed"], [], ["time", "time"]):
@@ -186,27 +151,10 @@ def test_everything_is_there(done, clip):
     assert rows["degree 0"]["floats"] == base.num_parameters - 6 * base.num_gaussians
     assert rows["cutoff radius 2, played"]["psnr"] != rows["base"]["psnr"]
     assert rows["cutoff radius 2, played"]["seconds"] == rows["base"]["seconds"]
+    assert rows["cutoff radius 2, played"]["settings"] == {"options.support_radius": 2.0}
+    assert rows["quality 30"]["settings"] == {"quality": 30}
     assert rows["quality 30"]["bytes"] < rows["quality 90"]["bytes"] < rows["base"]["bytes"]
     assert rows["quality 30"]["gaussians"] < rows["quality 90"]["gaussians"]
-
-
-def test_commands_reproduce_their_points(done, tmp_path, monkeypatch):
-    """One of each kind: the same PSNR, and where it writes a file the same bytes."""
-    monkeypatch.chdir(tmp_path)
-    rows = {name_of(row): row for row in record_of(done)["points"]}
-    chosen = ["batch 2", "cutoff stop 0.1, fitted", "cutoff alpha 1/32, played"]
-    for name in [*chosen, "quality 50"]:
-        words = shlex.split(rows[name]["command"])
-        assert words[0] == "foldgauss"
-        more = ["--json", "scores.json", "--overwrite"] if words[1] == "evaluate" else []
-        assert run(*words[1:], *more) == 0
-        if more:
-            psnr = json.loads(Path("scores.json").read_text())["mean_psnr"]
-        else:
-            path = Path(words[words.index("--out") + 1])
-            psnr = read_metadata(path)["mean_psnr"]
-            assert path.stat().st_size == rows[name]["bytes"]
-        assert psnr == pytest.approx(rows[name]["psnr"], abs=0.01), name
 
 
 def test_a_table_without_room_leaves_the_fits(clip, tmp_path, monkeypatch):
@@ -261,39 +209,33 @@ def test_a_point_that_fails_is_left_out(clip, tmp_path, monkeypatch):
     assert record_of(tmp_path / "r")["left_out"] == {}
 
 
-@pytest.mark.parametrize(
-    ("minutes", "steps", "out", "err"),
-    [
-        (1e-3, LEAST_STEPS, (), "warning: --minutes: 0.001 are too few for 5 points"),
-        (1.0, 1000, "about 1.0 minutes", ()),
-        (60.0, 3000, "5 points around a base of 3,000 steps", ()),
-    ],
-)
-def test_minutes_become_steps(clip, tmp_path, monkeypatch, minutes, steps, out, err):
-    """At a pace with which all fits take a minute if the base has 1,000 steps."""
-    work = 1 + sum(turn.work for axis in ("time", "compositing") for turn in AXES[axis])
-    pace = Throughput(start=0.0, step=60 / command.MARGIN / (work * 1000.001), evaluation=0.0)
-    monkeypatch.setattr(command, "_measure_throughput", lambda clip, config: pace)
-    monkeypatch.setattr(command, "run_jobs", Mock(side_effect=OSError("no fits here")))
-    arguments = ["--axes", "time,compositing", "--minutes", minutes]
-    call("tradeoff", clip, "--out", tmp_path / "r", *arguments, code=1, out=out, err=err)
-    assert record_of(tmp_path / "r")["plan"]["steps"] == steps
+def test_minutes_are_divided_among_the_fits(clip, tmp_path, monkeypatch):
+    """And the others have the base's steps and number of Gaussians."""
+    fits = Mock(wraps=command.run_jobs)
+    monkeypatch.setattr(command, "run_jobs", fits)
+    assert run("tradeoff", clip, "--out", tmp_path / "r", "--axes", "compositing,cutoff", "--minutes", 0.05) == 0
+    (base, *others) = fits.call_args.args[0]
+    assert len(others) == 4
+    assert base.config.minutes == pytest.approx(0.01)
+    steps = read_metadata(Path(base.target))["steps"]
+    expected = {(None, steps, load_video_model(base.target).num_gaussians)}
+    assert {(job.config.minutes, job.config.steps, job.config.num_gaussians) for job in others} == expected
 
 
 def test_other_settings_are_refused(done, clip, tmp_path):
     before = {path: path.read_bytes() for path in done.rglob("*.*")}
     for options, told in (
-        (["--frames", "1:6", "--steps", "13"], "steps was 12, is 13"),
-        (["--frames", "1:6", *QUICK, "--seed", "1"], "seed was 0, is 1"),
-        (QUICK, "num_frames was 5, is 6"),
-        (["--frames", "1:6", *QUICK, "--axes", "time"], "axes was"),
+        (["--frames", "1:6", "--steps", "13"], ["expected steps=12, got steps=13"]),
+        (["--frames", "1:6", *QUICK, "--seed", "1"], ["expected seed=0, got seed=1"]),
+        (QUICK, ["num_frames=5", "num_frames=6"]),
+        (["--frames", "1:6", *QUICK, "--axes", "time"], ["axes=['time', 'gaussians'", "got axes=['time']"]),
     ):
-        call("tradeoff", clip, "--out", done, *options, code=2, err=[told, "--overwrite"])
+        call("tradeoff", clip, "--out", done, *options, code=2, err=[*told, "--overwrite"])
     assert {path: path.read_bytes() for path in done.rglob("*.*")} == before
     # With it they are replaced; what is no result is not.
     target = tmp_path / "r"
     target.mkdir()
-    (target / "tradeoff.json").write_text('{"points": [{"axis": "base"}], "settings": {}}')
+    (target / "tradeoff.json").write_text('{"points": [{"axis": "base"}], "settings": []}')
     call("tradeoff", clip, "--out", target, "--axes", "time", *QUICK, code=2, err="got something else")
     assert run("tradeoff", clip, "--out", target, "--axes", "compositing", *QUICK, "--overwrite") == 0
     assert len(record_of(target)["points"]) == 2
@@ -313,7 +255,7 @@ def test_other_settings_are_refused(done, clip, tmp_path):
 
 
 def test_a_record_that_was_edited_is_refused(done, clip, tmp_path):
-    (tmp_path / "tradeoff.json").write_text(json.dumps(record_of(done) | {"plan": 3}))
+    (tmp_path / "tradeoff.json").write_text(json.dumps(record_of(done) | {"settings": 3}))
     before = (tmp_path / "tradeoff.json").read_bytes()
     call(
         "tradeoff",
@@ -324,7 +266,7 @@ def test_a_record_that_was_edited_is_refused(done, clip, tmp_path):
         "1:6",
         *QUICK,
         code=2,
-        err=["--out: expected results of `foldgauss tradeoff` in", "not iterable"],
+        err=["--out: expected results of `foldgauss tradeoff` in", "not a mapping"],
     )
     assert (tmp_path / "tradeoff.json").read_bytes() == before
 

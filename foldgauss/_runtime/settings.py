@@ -74,6 +74,13 @@ def flatten(values: dict[str, Any]) -> dict[str, Any]:
     return flat
 
 
+def check_unchanged(parameter: str, before: dict[str, Any], now: dict[str, Any], cure: str) -> None:
+    """Raise ValueError where settings, by names, are others than `before`, those of the run to be continued."""
+    changed = sorted(name for name in now.keys() | before.keys() if now.get(name) != before.get(name))
+    expected, got = (", ".join(f"{name}={one.get(name)!r}" for name in changed) for one in (before, now))
+    require(not changed, parameter, expected=expected, got=got, cure=cure)
+
+
 def settings_by_name(settings: Any) -> dict[str, Any]:
     """The values of `walk`, by their names."""
     return {name: value for name, _, value in walk(settings)}

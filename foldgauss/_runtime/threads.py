@@ -8,9 +8,9 @@ number of threads, results are the same to the bit for any number.
 import os
 import sys
 import threading
-import time
 from collections.abc import Callable, Iterable
-from concurrent.futures import Future, ThreadPoolExecutor, wait
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 
 from foldgauss._runtime.checks import is_integer, require
 
@@ -123,47 +123,47 @@ def run_tasks(task: Callable[[int], object], items: Iterable[int], *, serial: bo
         pool = _pool
     # One queue entry per thread, not per item: a Python future costs about as much as a small tile.
     pending = iter(items)
-    guard = threading.Lock()
+    guard = threading.Condition()
     errors: list[BaseException] = []
-    futures: list[Future] = []
-    in_work: list[None] = []  # one entry for each item in progress
+    at_work: list[None] = []  # one entry for each thread of the pool that takes items
 
     def drain() -> None:
         while True:
             with guard:
                 item = next(pending, None)
-                if item is None:
-                    return
-                in_work.append(None)
+            if item is None:
+                return
             _local.in_task = True
             try:
                 _call(task, item)
             except BaseException as error:
                 errors.append(error)
-                raise
+                return
             finally:
                 _local.in_task = False
-                in_work.pop()
 
-    all_known = True
+    def drain_on_pool() -> None:
+        with guard:
+            at_work.append(None)
+        drain()
+        with guard:
+            at_work.pop()
+            guard.notify()
+
     try:
-        try:
+        with suppress(RuntimeError):  # no more threads can be started
             for _ in range(min(threads, len(items)) - 1):
-                futures.append(pool.submit(drain))
-        except RuntimeError:  # the task may be in the queue all the same, without a future
-            all_known = False
+                pool.submit(drain_on_pool)
         drain()  # the calling thread works too
     finally:
         # Wait for all: arrays that they use may be freed once this returns.
         with guard:
             pending = iter(())
-        for future in futures:
-            while not future.done():
-                try:
-                    wait([future])
-                except KeyboardInterrupt as error:
-                    errors.insert(0, error)
-        while in_work and not all_known:
-            time.sleep(1e-3)
+        while at_work:
+            try:
+                with guard:
+                    guard.wait_for(lambda: not at_work)
+            except KeyboardInterrupt as error:
+                errors.insert(0, error)
     if errors:
         raise errors[0]

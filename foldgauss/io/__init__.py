@@ -16,7 +16,7 @@ from foldgauss.io.exchange.gaussians_ply import (
     write_gaussians_ply,
 )
 from foldgauss.io.exchange.ply_file import FormatError
-from foldgauss.io.exchange.pseudomesh import Pseudomesh, read_pseudomesh, write_pseudomesh
+from foldgauss.io.exchange.pseudomesh import write_pseudomesh
 from foldgauss.io.exchange.vegas_ply import read_vegas_ply, write_vegas_ply, write_vegas_segments
 from foldgauss.io.history import HistoryFile, read_history, write_curves
 from foldgauss.io.media.clip import Clip, VideoError
@@ -41,7 +41,6 @@ __all__ = [
     "LazyFrames",
     "ModelFileError",
     "OutputError",
-    "Pseudomesh",
     "Sound",
     "VideoError",
     "format_indices",
@@ -57,7 +56,6 @@ __all__ = [
     "read_history",
     "read_indexed",
     "read_masks",
-    "read_pseudomesh",
     "read_vegas_ply",
     "read_video",
     "save_compact",

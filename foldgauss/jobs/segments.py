@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from foldgauss._runtime.checks import is_integer, is_within, require
-from foldgauss._runtime.settings import flatten
+from foldgauss._runtime.settings import check_unchanged, flatten
 from foldgauss.io import FrameIndex, index_video, join_segments, read_indexed
 from foldgauss.io._atomic import OutputError, atomic_path
 from foldgauss.io.models.video_model import MODEL_SUFFIX, keep_origin, load_video_model, read_metadata
@@ -150,7 +150,7 @@ def plan_long_fit(
     require(is_integer(overlap, 1), "overlap", expected="a whole number of frames >= 1", got=repr(overlap))
     clip, target = Path(clip).absolute(), Path(target).absolute()
     folder = segments_folder(target)
-    request = {"config": dataclasses.asdict(config), "size": size, "frames": frames}
+    request = flatten(dataclasses.asdict(config)) | {"size": size, "frames": frames}
     request = json.loads(json.dumps(request | {"segment_seconds": float(segment_seconds), "overlap": overlap}))
     if restart:
         _check_folder(folder)
@@ -234,20 +234,12 @@ def _load_plan(folder: Path, request: dict[str, Any]) -> dict[str, Any] | None:
     """The plan in the folder; None if it cannot be read. Raises ValueError if it is that of another request."""
     try:
         plan = json.loads((folder / _PLAN).read_text())
-        before = plan["asked"]
-        before.get("config", {}).get("seed")
+        before = {**plan["asked"]}
         plan["digest"], plan["clip"]
     except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError):
         return None
-    before, now = ({**one, **flatten(one.get("config", {}))} for one in (before, request))
-    pairs = {name: (before.get(name), now[name]) for name in now if name != "config" and before.get(name) != now[name]}
-    require(
-        not pairs,
-        "overwrite",
-        expected=", ".join(f"{name}={pair[0]!r}" for name, pair in pairs.items()),
-        got=", ".join(f"{name}={pair[1]!r}" for name, pair in pairs.items()),
-        cure=f"An unfinished fit is in {str(folder)!r}: give its options, or start over with --overwrite.",
-    )
+    cure = f"An unfinished fit is in {str(folder)!r}: give its options, or start over with --overwrite."
+    check_unchanged("overwrite", before, request, cure)
     return plan
 
 

@@ -31,7 +31,7 @@ from foldgauss.video.models.video_model import VideoModel
 from foldgauss.video.motion.background_plate import fill_background
 from foldgauss.video.motion.camera_path import CameraPath, estimate_camera_path
 from foldgauss.video.motion.moving_object import NothingMoves, find_moving_object
-from foldgauss.video.motion.slow_motion import even_durations, interpolate_frames
+from foldgauss.video.motion.slow_motion import interpolate_frames
 from foldgauss.video.motion.stabilization import StabilizedVideo, stabilize
 from foldgauss.video.segmented.layering import layers
 from foldgauss.video.segmented.segmented_edit import SegmentedEdit
@@ -95,7 +95,6 @@ __all__ = [
     "edit",
     "estimate_camera_path",
     "evaluate",
-    "even_durations",
     "fill_background",
     "find_moving_object",
     "fit",

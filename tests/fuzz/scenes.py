@@ -1,9 +1,7 @@
-"""Targets: files of other programs, PLY and OBJ, and what lies beside them."""
+"""Targets: files of other programs, PLY."""
 
 import functools
-import json
 import struct
-import tempfile
 from pathlib import Path
 from random import Random
 
@@ -12,16 +10,13 @@ import numpy as np
 from foldgauss.io import (
     FormatError,
     read_3dgs_ply,
-    read_pseudomesh,
     read_vegas_ply,
     write_3dgs_ply,
-    write_pseudomesh,
     write_vegas_ply,
 )
-from foldgauss.io.exchange.pseudomesh import read_obj
 
 from .models import tiny_model, written
-from .mutate import by_chance, json_text_changed, one_of
+from .mutate import by_chance, json_text_changed
 from .target import Target, chance
 
 
@@ -103,85 +98,4 @@ SCENE = Target(
 )  # fmt: skip
 
 
-# ---------------------------------------------------------------------------------------------- pseudomeshes
-
-
-@functools.cache
-def _mesh() -> dict[str, bytes]:
-    """The files of a folder with one frame."""
-    with tempfile.TemporaryDirectory() as folder:
-        made = write_pseudomesh(Path(folder) / "mesh", tiny_model(), [0.5])
-        return {path.name: path.read_bytes() for path in made.iterdir()}
-
-
-def _beside(folder: Path, but: str) -> None:
-    for name, data in _mesh().items():
-        if name != but:
-            (folder / name).write_bytes(data)
-
-
-def _tool(data: bytes) -> bytes:
-    """As a mesh tool writes it: groups, normals, comments, indices with slashes."""
-    lines = [b"# a tool", b"mtllib a.mtl", b"o frame", b"vn 0 0 1", b"", b"s off"]
-    for line in data.split(b"\n"):
-        words = line.split()
-        if line.startswith(b"v "):
-            lines.append(b"v " + b" ".join(words[1:4]) + b" # a comment")
-        elif line.startswith(b"f "):
-            lines.append(b"f " + b" ".join(word + b"//1" for word in words[1:]))
-    return b"\r\n".join(lines) + b"\r\n"
-
-
-_LINES = (
-    b"v 0 0 0", b"v nan 0 0", b"v 1e39 0 0", b"v 1e38 1e38 -1e38", b"v 1 2", b"v a b c", b"v", b"f 1 2 3", b"f 1 2 3 4",
-    b"f 3 2 1", b"f 0 1 2", b"f -1 -2 -3", b"f 1/2/3 2 3", b"f 99999999999 1 2", b"f " + b"9" * 5000 + b" 1 2", b"f",
-    b"vt 0 0", b"\\", b"v 1_0 0 0", b"v 0x1 0 0", b"f 1.0 2 3", "v １ 0 0".encode(), b"# " + b"a" * 100, b"v 1e-46 0 0",
-    b"v -0 -0 -0",
-)  # fmt: skip
-_ENDS = (b"\\", b" \\", b"#", b" 1", b"\r\r", b"\x0b1", b"\x1c")
-
-
-def _line(line: bytes, random: Random) -> bytes:
-    """One of a kind that the format knows, or the same with another end."""
-    return random.choice((random.choice(_LINES), random.choice(_LINES), line.rstrip(b"\r") + random.choice(_ENDS)))
-
-
-def _read_mesh(path: Path) -> None:
-    read_obj(path)
-    assert read_pseudomesh(path.parent).num_frames == 1
-
-
-OBJ = Target(
-    "obj",
-    ".obj",
-    lambda: [_mesh()["frame_0000.obj"], _tool(_mesh()["frame_0000.obj"])],
-    _read_mesh,
-    (FormatError,),
-    (one_of(_line),),
-    prepare=lambda folder: _beside(folder, "frame_0000.obj"),
-    file_name="frame_0000",
-)
-
-
-def _read_notes(path: Path) -> None:
-    given = {} if chance(path) % 4 else {"size": (4, 6), "fps": 12}
-    mesh = read_pseudomesh(path.parent, **given)
-    assert mesh.fps > 0
-
-
-NOTES = Target(
-    "mesh-notes",
-    ".json",
-    lambda: [
-        _mesh()["pseudomesh.json"],
-        b'{"size": [4, 6]}',
-        json.dumps({"size": [4, 6], "times": [0.5], "fps": 5, "extra": 1, "compositing": "sum"}).encode(),
-    ],
-    _read_notes,
-    (FormatError,),
-    (json_text_changed,),
-    prepare=lambda folder: _beside(folder, "pseudomesh.json"),
-    file_name="pseudomesh",
-)
-
-TARGETS = (VEGAS, SCENE, OBJ, NOTES)
+TARGETS = (VEGAS, SCENE)

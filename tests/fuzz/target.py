@@ -40,11 +40,10 @@ class Target:
     body: Callable[[bytes], int] = lambda data: 0
     memory: Callable[[int], int] = lambda size: 2 * CONSTANT + 400 * size
     prepare: Callable[[Path], None] = lambda folder: None
-    file_name: str = "case"
     says: tuple[str, ...] = ("expected",)
 
     def path(self, folder: Path) -> Path:
-        return folder / f"{self.file_name}{self.suffix}"
+        return folder / f"case{self.suffix}"
 
     def mutant(self, random: Random, corpus: list[bytes]) -> bytes:
         """A bad file: half by a mutation that knows the format, half by chance, most of these behind the header."""

@@ -17,12 +17,10 @@ from foldgauss.io import (
     html_page,
     join_segments,
     load_video_model,
-    read_pseudomesh,
     read_vegas_ply,
     save_compact,
     save_video_model,
     write_3dgs_ply,
-    write_pseudomesh,
     write_vegas_segments,
 )
 from foldgauss.io.models import segmented
@@ -335,9 +333,6 @@ def test_frames_go_out_as_they_are_played(tmp_path):
     parts = [soft_model(seed=k, num_frames=num) for k, num in enumerate(LENGTHS)]
     video = SegmentedVideo.from_models(list(zip(FIRSTS, parts, strict=True)))
     t = 15 / 17
-    write_pseudomesh(tmp_path / "mesh", video, [t])
-    mesh = read_pseudomesh(tmp_path / "mesh")
-    assert np.abs(next(mesh.frames()).astype(int) - VideoRenderer(video).frame(t)).max() <= 1
     write_3dgs_ply(tmp_path / "scene.ply", video, t)
     write_3dgs_ply(tmp_path / "own.ply", parts[2], 0.5)
     assert (tmp_path / "scene.ply").read_bytes() == (tmp_path / "own.ply").read_bytes()

@@ -125,11 +125,10 @@ def test_identity_edits_are_exact(name, when):
 
 
 def test_functions_that_change_nothing_are_exact():
-    chain = edit(MODEL)
-    for video in (chain.apply(lambda g, t: g).video(), chain.apply_triangles(lambda v, t: v).video()):
-        assert isinstance(video, EditedVideo)
-        assert apart(video, MODEL, 0.31) == 0
-        np.testing.assert_array_equal(list(video.frames()), list(MODEL.frames()))
+    video = edit(MODEL).apply(lambda g, t: g).video()
+    assert isinstance(video, EditedVideo)
+    assert apart(video, MODEL, 0.31) == 0
+    np.testing.assert_array_equal(list(video.frames()), list(MODEL.frames()))
 
 
 # ---------------------------------------------------------------------------------------------------- composition
@@ -200,7 +199,6 @@ ONE_FRAME = {
     "multiply": lambda e: e.multiply([(0, 0.05)], frame=3, originals=True),
     "retime": lambda e: e.retime(shift=0.5, frame=3),
     "place": lambda e: e.place(depth=-0.3, rotate=(0, 1, 0), frame=3),
-    "triangles": lambda e: e.apply_triangles(lambda v, t: v * np.float32(1.2), frame=3),
 }
 
 
@@ -475,24 +473,21 @@ def test_arrays_that_a_function_returns_as_they_were_keep_their_bits():
     np.testing.assert_array_equal(larger.mean, before.mean)
 
 
-def test_functions_of_triangles():
-    """A shift, a turn and a mirror of vertices are those edits."""
+def test_functions_are_the_edits_that_they_compute():
+    """A turn and a mirror of means and factors; half of a shift at half of the progress."""
     chain = edit(MODEL).select(OBJECT)
 
-    def through(matrix, vertices):
-        out = vertices.copy()
-        out[..., :2] = vertices[..., :2] @ matrix.T + [0.1, 0.05]
-        return out
+    def through(matrix):
+        matrix = np.float32(matrix)
+        return lambda g, t: replace(g, mean=g.mean @ matrix.T + np.float32([0.1, 0.05]), factor=matrix @ g.factor)
 
     turn = np.array([[np.cos(0.7), -np.sin(0.7)], [np.sin(0.7), np.cos(0.7)]]) * 1.3
     for matrix in (turn, turn @ np.diag([1, -1])):
         expected = chain.transform(matrix, (0.1, 0.05), about=(0, 0)).video()
-        assert (
-            apart(chain.apply_triangles(lambda v, t, matrix=matrix: through(matrix, v)).video(), expected, 0.31) < 1e-3
-        )
-    half = chain.apply_triangles(lambda v, t: v + np.float32([0.2, 0, 0]), frames=(1, 6), ease=2).video()
-    expected = chain.move((0.05, 0)).video()
-    assert apart(half, expected, TIMES[1]) < 1e-3
+        assert apart(chain.apply(through(matrix)).video(), expected, 0.31) < 1e-3
+    shift = lambda g, t: replace(g, mean=g.mean + np.float32([0.2, 0]))  # noqa: E731
+    half = chain.apply(shift, frames=(1, 6), ease=2).video()
+    assert apart(half, chain.move((0.05, 0)).video(), TIMES[1]) < 1e-3
 
 
 # ------------------------------------------------------------------------------------------------------ who, and errors
@@ -549,7 +544,6 @@ def in_place(gaussians, t):
 
 
 ODD = np.arange(NUM) % 2 == 1
-FLAT = "vertices: expected triangles whose three vertices span a plane, got 40 without area, the first at index 0"
 WRONG = {
     "no video": (lambda: edit(MODEL.splats), "video: expected a VideoModel or an EditedVideo"),
     "mask of others": (lambda: E.select(OBJECT[:-1]), "selection: expected a Selection or mask of 40"),
@@ -599,7 +593,6 @@ WRONG = {
         lambda: E.apply(lambda g: g),
         r"function: expected a function of \(gaussians, t\), got one of \(g",
     ),
-    "of triangles": (lambda: E.apply_triangles(lambda v: v), r"function: expected a function of \(vertices, t\)"),
     "camera of none": (lambda: E.seen_from(lambda: 3), r"camera: expected a function of \(t\), got one of \(\)"),
     "camera itself": (lambda: E.seen_from(Camera), r"camera: expected a function of \(t\), got the class Camera"),
     "selection of none": (lambda: E.select(lambda: OBJECT), r"selection: expected a function of \(video\)"),
@@ -634,13 +627,6 @@ WRONG = {
         "function: expected the same Gaussians",
     ),
     "in place": (lambda: rendered(E.apply(in_place)), ".*read-only"),
-    "flat triangles": (lambda: rendered(E.apply_triangles(lambda v, t: np.repeat(v[:, :1], 3, 1))), FLAT),
-    "nan triangles": (lambda: rendered(E.apply_triangles(lambda v, t: v * np.nan)), "vertices: expected finite"),
-    "fewer triangles": (
-        lambda: rendered(E.apply_triangles(lambda v, t: v[1:])),
-        r"vertices: expected numbers of shape \(40, 3, 3\)",
-    ),
-    "no triangles": (lambda: rendered(E.apply_triangles(lambda v, t: None)), "vertices: expected numbers of shape"),
     "nobody to the front": (lambda: E.select(~(OBJECT | True)).to_front(), "selection"),
     "mask of now": (
         lambda: E.select(OBJECT).multiply([(0.1, 0)]).select(np.ones(59, bool)),

@@ -212,10 +212,11 @@ def test_edits_go_on_in_space():
     plain = edit(MODEL).select(OBJECT).move((0.1, 0)).recolor((1, 0, 0)).rotate(0.3).place(depth=-0.3).video()
     assert apart(video, plain, 0.31) < 1e-4  # a shift of depth commutes with what is done in the plane
 
-    def lift(vertices, t):
-        return vertices + np.float32([0, 0, -0.3])
+    def lift(gaussians, t):
+        lifted = gaussians.in_space()
+        return dataclasses.replace(lifted, mean=lifted.mean + np.float32([0, 0, -0.3]))
 
-    lifted = edit(MODEL).select(OBJECT).apply_triangles(lift).video()
+    lifted = edit(MODEL).select(OBJECT).apply(lift).video()
     assert apart(lifted, edit(MODEL).select(OBJECT).place(depth=-0.3).video(), 0.31) < 1e-3
 
 
@@ -262,7 +263,6 @@ def test_a_folded_model_stays_one_on_disk(tmp_path):
     ("make", "got"),
     [
         (lambda e: e.apply(lambda g, t: g), "overlays: .* got GaussianFunction"),
-        (lambda e: e.apply_triangles(lambda v, t: v), "overlays: .* got TriangleFunction"),
         (lambda e: e.seen_from(lambda t: Camera.front(ASPECT)), "camera: .* got a function"),
     ],
 )

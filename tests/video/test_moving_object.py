@@ -1,6 +1,5 @@
 """The moving object of a clip, found without input, and the background behind it."""
 
-import logging
 import re
 
 import cv2
@@ -105,7 +104,7 @@ def test_pixels_near_the_object_are_assigned_by_color():
     assert not _assign_by_color(frames, np.zeros_like(votes)).any()
 
 
-def test_the_background_is_filled_in_from_other_frames(caplog):
+def test_the_background_is_filled_in_from_other_frames():
     frames, empty, truth = disc_clip(pan=4.0, speed=1.0, num_frames=10)
     alignment = Alignment.from_frames(frames)
     assert alignment.shots == [(0, 10)]
@@ -115,9 +114,8 @@ def test_the_background_is_filled_in_from_other_frames(caplog):
     assert psnr(filled, empty) > 35 > 25 > psnr(frames, empty)
     # Without other frames to fill it from, the hole is filled from its surroundings.
     everywhere = np.broadcast_to(truth.any(0), truth.shape)
-    with caplog.at_level(logging.INFO):
+    with pytest.warns(UserWarning, match=r"^\d\d% of the removed area is shown by no frame .*"):
         assert 30 > psnr(fill_background(frames[:3], everywhere[:3]), empty[:3]) > psnr(frames[:3], empty[:3])
-    assert re.fullmatch(r"\d\d% of the removed area is shown by no frame .*", caplog.messages[0])
 
 
 @pytest.mark.parametrize(
@@ -131,18 +129,18 @@ def test_where_nothing_moves_this_is_an_error(pan, noise):
         find_moving_object(noisy)
 
 
-def test_each_shot_has_its_own_object_or_none(caplog):
+def test_each_shot_has_its_own_object_or_none():
     one, _, truth = disc_clip(num_frames=5)
     other, _, other_truth = disc_clip(pan=0.0, speed=-2.0, seed=5, num_frames=5)
     still, _, _ = disc_clip(pan=0.0, seed=9, disc=False, num_frames=3)
-    with caplog.at_level(logging.INFO):
+    with pytest.warns(UserWarning, match=r"^No moving object was found in the shots of frames 10:13\.$"):
         masks = find_moving_object(np.concatenate([one, other[:, ::-1], still]))
     assert overlap(masks[:5], truth).mean() >= 0.85
     assert overlap(masks[5:10], other_truth[:, ::-1]).mean() >= 0.85
     assert not masks[10:].any()
-    assert caplog.messages == ["No moving object was found in the shots of frames 10:13."]
 
 
+@pytest.mark.filterwarnings("default:.*of the removed area is shown by no frame", "default:No moving object was found")
 def test_plate_tells_of_shots_and_of_what_no_frame_shows(tmp_path, capsys):
     one, other = (named_model(num_frames=num)[0] for num in (6, 4))
     still = edit(other).freeze(2).transform([[0, 1], [-1, 0]], about=(0, 0)).video()
@@ -150,7 +148,7 @@ def test_plate_tells_of_shots_and_of_what_no_frame_shows(tmp_path, capsys):
     assert run("render", "--plate", tmp_path / "m.safetensors", "--out", tmp_path / "images") == 0
     told = capsys.readouterr()
     assert "2 shots, each on its own; they begin at frames 0, 6." in told.err
-    assert "No moving object was found in the shots of frames 6:10." in told.out
+    assert "warning: No moving object was found in the shots of frames 6:10." in told.err
     warning = r"warning: \d+% of the removed area is shown by no frame and filled from its surroundings\. It is a smear"
     assert re.search(warning, " ".join(told.err.split()))
 
@@ -212,7 +210,7 @@ def test_select_combines_motion_with_other_criteria(moving, searched):
     assert len(select(model, moving=True, threshold=0.99)) < len(searched)
 
 
-def test_segments_are_searched_one_by_one(moving, searched, monkeypatch, caplog):
+def test_segments_are_searched_one_by_one(moving, searched, monkeypatch):
     model, _, _ = moving
     num, calls = model.num_frames, []
     video = SegmentedVideo.from_models([(0, model), (num, model)])
@@ -226,18 +224,11 @@ def test_segments_are_searched_one_by_one(moving, searched, monkeypatch, caplog)
 
     monkeypatch.setattr(selectors, "find_moving_object", search)
     search.still = False
-    with caplog.at_level(logging.INFO):
+    with pytest.warns(
+        UserWarning, match="^Segment 0, from frame 0 on: moving: expected an object, got none. Select by"
+    ):
         found = edit(video).select(moving=True).selection.mask
-        assert found.sum() == found[-searched.num_gaussians :].sum() == len(searched)
-    searching = "Searching for what moves against the background ..."
-    assert caplog.messages == [
-        "Segment 0, whose first frame, 0, is frame 0 of the clip:",
-        searching,
-        "moving: expected an object, got none. Select by a mask, a box or a click.",
-        f"Segment 1, whose first frame, 0, is frame {num} of the clip:",
-        searching,
-        f"The moving object has {len(searched)} of {model.num_gaussians:,} Gaussians.",
-    ]
+    assert found.sum() == found[-searched.num_gaussians :].sum() == len(searched)
     search.still = True
-    with pytest.raises(NothingMoves):
+    with pytest.warns(UserWarning, match="^Segment"), pytest.raises(NothingMoves):
         edit(video).select(moving=True)

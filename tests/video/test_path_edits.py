@@ -12,9 +12,7 @@ from soft_models import NUM, OBJECT, SIZE, soft_model
 from foldgauss.io import (
     frame_gaussians,
     load_video_model,
-    read_pseudomesh,
     save_video_model,
-    write_pseudomesh,
 )
 from foldgauss.render import Camera, project
 from foldgauss.video import EditedVideo, SegmentedVideo, VideoModel, edit, layers, select
@@ -119,10 +117,8 @@ def test_files_of_edited_videos_and_segments(tmp_path):
         np.testing.assert_array_equal(VideoRenderer(joined).frame(t), VideoRenderer(long).frame(t))
 
 
-def test_frames_for_other_programs_are_those_of_the_model(tmp_path):
+def test_frames_for_other_programs_are_those_of_the_model():
     video = edit(MODEL).select(OBJECT).move((0.1, 0)).video()
-    mesh = read_pseudomesh(write_pseudomesh(tmp_path / "mesh", video, [0.3]))
-    np.testing.assert_allclose(next(mesh.frames()), VideoRenderer(video).frame(0.3), atol=1)
     seen = project(frame_gaussians(video, 0.3), Camera.front(SIZE[0] / SIZE[1]), SIZE)
     np.testing.assert_allclose(seen.mean, VideoRenderer(video).splats(0.3).mean, atol=1e-3)
 

@@ -189,7 +189,7 @@ def test_what_is_given_for_one_time():
         t = position / 22
         own = parts[number]
         expected = own.prepare(SIZE).splats(own.frame_times.times()[position - FIRSTS[number]])
-        for found in (clip.at(t), VideoRenderer(clip).splats(t), VideoRenderer(clip).dominant_splats(t)):
+        for found in (clip.at(t), VideoRenderer(clip).splats(t)):
             np.testing.assert_array_equal(found.mean, expected.mean)
             np.testing.assert_array_equal(found.opacity, expected.opacity)
     np.testing.assert_array_equal(clip.render(0.3), np.moveaxis(image(clip, 0.3), 0, -1))

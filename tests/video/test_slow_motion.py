@@ -1,7 +1,6 @@
 """Images between frames: the video's own and the prediction by optical flow, averaged where that is possible."""
 
 import dataclasses
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -13,7 +12,6 @@ from foldgauss.video import (
     FrameTimes,
     VideoModel,
     edit,
-    even_durations,
     fit,
     interpolate_frames,
     interpolated_times,
@@ -136,27 +134,3 @@ def test_pairs_are_joined_to_the_motion_of_all(model):
 def test_bad_times_are_refused(model):
     with pytest.raises(ValueError, match="times: expected a list of times"):
         list(interpolate_frames(model, np.array([1.5])))
-
-
-@pytest.mark.parametrize(
-    ("steps", "repeats"),
-    [
-        ([1, 1, 1, 0, 1, 1], [3]),
-        ([1, 1, 1, 0.3, 1, 1], [3]),  # a model that reproduces the repetition in part
-        ([1, 0, 1, 0, 1, 0, 1], [1, 3, 5]),  # each frame twice
-        ([1, 1, 0, 0, 0, 1], []),  # rests
-        ([4, 3, 2, 1, 1, 2], []),  # slows down
-        ([-2, -1, 0, 1, 2], []),  # turns
-        ([0, 0, 0, 1, 1], []),  # begins
-        ([1], []),
-    ],
-)
-def test_repeated_frames_are_found(model, steps, repeats):
-    """A picture that moves by so many steps of two pixels."""
-    image = next(model.frames())
-    places = np.cumsum([0.0, *steps]) * 2
-    frames = [scipy.ndimage.shift(image, (0, at, 0), order=1, mode="nearest") for at in places]
-    video = SimpleNamespace(size=image.shape[:2], frames=lambda size: iter(frames))
-    durations = even_durations(video)
-    np.testing.assert_array_equal(np.flatnonzero(durations < 1), repeats)
-    np.testing.assert_allclose(durations[repeats], np.array(steps)[repeats], atol=0.15)

@@ -110,7 +110,6 @@ EXAMPLES: Mapping[str, Mapping[str, str]] = MappingProxyType(
         },
         "import": {
             "A VeGaS model, into video.safetensors": "foldgauss import video.ply",
-            "Frames edited as triangles, into mesh.mp4": "foldgauss import mesh/ --fps 24",
         },
         "uncertainty": {
             "Tables and figures into steady-uncertainty, of a model that was fitted with --no-follow-camera": (

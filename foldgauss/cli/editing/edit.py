@@ -11,7 +11,7 @@ import typer
 from foldgauss._runtime.checks import require
 from foldgauss.cli.app.application import command, out
 from foldgauss.cli.shared.arguments import ModelFile, Overwrite, Size, Timeline, parse_size
-from foldgauss.cli.shared.console import print_log
+from foldgauss.cli.shared.console import show_status
 from foldgauss.cli.shared.files import check_images_output, check_output, name_after, refuse_huge
 from foldgauss.cli.shared.rendering import Output, SoundFile, choose_sound
 from foldgauss.io._atomic import write_or_keep
@@ -73,7 +73,7 @@ def edit_command(
     output = Output(out_path, model.fps, overwrite, encoding={"sound": sounding})
     if not as_model:
         output.check(image_size or model.size, model.num_frames)
-    with print_log():
+    with show_status(f"Applying {script_path.name}"):
         edited = script.apply(model, about)
     if as_model:
         about = keep_origin(about, *CLIP_NOTES) | {"edited_by": script_path.name}

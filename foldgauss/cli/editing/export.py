@@ -12,19 +12,15 @@ from foldgauss.cli.shared.arguments import ModelFile, Overwrite, Size, parse_siz
 from foldgauss.cli.shared.console import format_count, progress_bar
 from foldgauss.cli.shared.files import (
     Video,
-    check_images_output,
     check_output,
     name_after,
     refuse_existing,
-    refuse_huge,
     refuse_inputs,
 )
-from foldgauss.cli.shared.rendering import Output
 from foldgauss.io._atomic import write_or_keep
 from foldgauss.io.exchange.gaussians_ply import write_3dgs_frames, write_3dgs_ply
-from foldgauss.io.exchange.pseudomesh import read_pseudomesh, write_pseudomesh
+from foldgauss.io.exchange.pseudomesh import write_pseudomesh
 from foldgauss.io.exchange.vegas_ply import read_vegas_ply, write_vegas_ply, write_vegas_segments
-from foldgauss.io.media.writing import VIDEO_SUFFIXES
 from foldgauss.io.models.video_model import (
     MODEL_SUFFIX,
     keep_origin,
@@ -164,39 +160,24 @@ def import_command(
         Path,
         typer.Argument(
             metavar="FILE",
-            help="A .ply of VeGaS, or a folder of .obj and .ply.",
+            help="A .ply of VeGaS.",
         ),
     ],
     out_path: Annotated[
         Path | None,
         typer.Option(
             "--out",
-            help=f"FILE{MODEL_SUFFIX}; of a folder of triangles: a video or a folder "
-            f"[default: by FILE's name, {MODEL_SUFFIX} or .mp4].",
+            help=f"FILE{MODEL_SUFFIX} [default: FILE's name in this folder].",
         ),
     ] = None,
     size: Size = None,
     fps: Annotated[float | None, typer.Option(help="Frames per second [default: the file's, or 25].")] = None,
     overwrite: Overwrite = False,
 ) -> None:
-    """Read a model of another program, see docs/formats.md.
-
-    Triangles cannot be converted back into Gaussians: they are rendered as images.
-    """
-    image_size = parse_size(size)
-    if out_path is None:
-        out_path = name_after(source, VIDEO_SUFFIXES[0] if source.is_dir() else MODEL_SUFFIX)
-    if source.is_dir():
-        check_images_output(out_path, overwrite, {})
-        refuse_huge(image_size)
-        mesh = read_pseudomesh(source, size=image_size, fps=fps)
-        refuse_huge(mesh.size)
-        output = Output(out_path, mesh.fps, overwrite)
-        output.check(mesh.size, mesh.num_frames)
-        output.write(mesh.frames, mesh.num_frames)
-        return
+    """Read a model of another program, see docs/formats.md."""
+    out_path = name_after(source, MODEL_SUFFIX) if out_path is None else out_path
     require(out_path.suffix.lower() == MODEL_SUFFIX, "--out", expected=f"a name ending in {MODEL_SUFFIX}", got=out_path)
     check_output(out_path, overwrite, {"file": source})
-    model = read_vegas_ply(source, size=image_size, fps=fps)
+    model = read_vegas_ply(source, size=parse_size(size), fps=fps)
     save_video_model(out_path, model, metadata={"clip": source.name})
     out.print(f"{out_path}: {model.num_frames} frames, {model.num_gaussians:,} Gaussians", soft_wrap=True)

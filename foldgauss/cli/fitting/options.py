@@ -14,7 +14,6 @@ from foldgauss._runtime.checks import require
 from foldgauss._runtime.settings import setting_of, settings_by_name, type_of, walk
 from foldgauss._runtime.threads import available_cores
 from foldgauss.cli.app.help import complete_choice
-from foldgauss.cli.shared.arguments import override_constants
 from foldgauss.cli.shared.console import format_count
 from foldgauss.jobs import local_workers, running_cluster
 from foldgauss.video.fitting.config import BUDGET, MODEL, OPTIMIZATION, PRESETS, FitConfig
@@ -94,9 +93,6 @@ RARE = {
     "interpolation_fraction",
     "interpolation_end",
 }
-#: Constants of the renderer, which fits rarely change.
-_CONSTANTS = ("alpha_cutoff", "support_radius", "transmittance_stop")
-_Constant = Annotated[float | None, typer.Option(hidden=True)]
 #: How help writes the values of settings.
 _METAVARS = {int: "N", float: "X", str: "NAME"}
 
@@ -153,10 +149,8 @@ class WorkerOptions:
 
 def config_from_options(preset: str, **options: Any) -> FitConfig:
     """The configuration that options, by the names of settings, come to; None leaves the preset's value."""
-    constants = [options.pop(name) for name in _CONSTANTS]
     given = {SETTINGS[parameter][0]: value for parameter, value in options.items() if value is not None}
-    config = FitConfig.preset(preset, **given)
-    return dataclasses.replace(config, options=override_constants(config.options, *constants))
+    return FitConfig.preset(preset, **given)
 
 
 def fit_options(command: Callable[..., None]) -> Callable[..., None]:
@@ -168,7 +162,6 @@ def fit_options(command: Callable[..., None]) -> Callable[..., None]:
     options = [
         inspect.Parameter("preset", _KIND, default="standard", annotation=Preset),
         *(_option(name, field) for name, field in SETTINGS.values()),
-        *(inspect.Parameter(name, _KIND, default=None, annotation=_Constant) for name in _CONSTANTS),
     ]
     own = list(inspect.signature(command).parameters.values())
     at = [parameter.name for parameter in own].index("config")

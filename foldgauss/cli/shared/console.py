@@ -1,9 +1,7 @@
 """What commands print: progress, lines of a log, and results as tables and JSON."""
 
-import contextlib
 import itertools
 import json
-import logging
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -27,30 +25,6 @@ from foldgauss.video.segmented.segmented_video import SegmentedVideo
 
 #: Most frame numbers that a message prints.
 LISTED_FRAMES = 8
-
-
-class _Printer(logging.Handler):
-    """Prints the message of each record on one line, as a warning if it is one."""
-
-    def emit(self, record: logging.LogRecord) -> None:
-        if record.levelno >= logging.WARNING:
-            warn(record.getMessage())
-        else:
-            out.print(record.getMessage(), soft_wrap=True)
-
-
-@contextlib.contextmanager
-def print_log() -> Iterator[None]:
-    """Print what the package logs at level INFO or above."""
-    logger, handler = logging.getLogger("foldgauss"), _Printer()
-    before = logger.level
-    logger.addHandler(handler)
-    logger.setLevel(logging.INFO)
-    try:
-        yield
-    finally:
-        logger.removeHandler(handler)
-        logger.setLevel(before)
 
 
 def print_shots(starts: tuple[int, ...], times: Float[np.ndarray, " frames"]) -> None:

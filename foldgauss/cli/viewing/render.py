@@ -26,7 +26,7 @@ from foldgauss.cli.shared.arguments import (
     parse_times,
     refuse_together,
 )
-from foldgauss.cli.shared.console import Video, print_log, print_shots, progress_bar
+from foldgauss.cli.shared.console import Video, print_shots, progress_bar
 from foldgauss.cli.shared.files import IMAGE_SUFFIX, check_images_output, name_after, refuse_huge
 from foldgauss.cli.shared.rendering import (
     Output,
@@ -275,9 +275,8 @@ def _make_plate(
     out.print("Searching for what moves against the background ..." if masks is None else "Aligning frames ...")
     alignment = Alignment.from_frames(frames)
     print_shots(alignment.starts, np.asarray(model.frame_times.times()))
-    with print_log():
-        masks = _find_object(frames, alignment) if masks is None else masks
-        plate = fill_background(frames, masks, alignment=alignment)
+    masks = _find_object(frames, alignment) if masks is None else masks
+    plate = fill_background(frames, masks, alignment=alignment)
     output.write(lambda: plate, len(plate))
     if save_masks is not None:
         images = partial(map, lambda mask: np.repeat(np.uint8(255 * mask)[..., None], 3, -1), masks)

@@ -58,7 +58,7 @@ def frame_gaussians(model: RenderedVideo | VideoRenderer, t: float, *, depth_ste
         got=repr(t),
     )
     renderer = model if isinstance(model, VideoRenderer) else VideoRenderer(model)
-    splats = renderer.dominant_splats(float(t))
+    splats = renderer.splats(float(t))
     seen = np.asarray(splats.opacity) > 0
     leaves = (splats.mean, splats.factor, splats.opacity, splats.color)
     mean, factor, opacity, color = (np.asarray(leaf, np.float64)[seen] for leaf in leaves)

@@ -6,8 +6,7 @@ from pathlib import Path
 import jax
 import numpy as np
 
-from foldgauss._runtime.checks import invalid
-from foldgauss._runtime.settings import flatten
+from foldgauss._runtime.settings import check_unchanged, flatten
 from foldgauss.io._atomic import PathLike
 from foldgauss.io.models.model_file import Kind, load_part, register_model, save_model
 from foldgauss.io.models.video_model import read_header_of_kind
@@ -33,12 +32,8 @@ def load_checkpoint(path: PathLike, *, config: FitConfig, source: dict) -> FitSt
     kept = about["metadata"]
     for part, now in (("config", dataclasses.asdict(config)), ("source", source)):
         before = kept.get(part)
-        now, before = flatten(now), flatten(before if isinstance(before, dict) else {})
-        changed = sorted(name for name in now.keys() | before.keys() if now.get(name) != before.get(name))
         cure = f"Resume {str(path)!r} with the options it was started with, or start a new fit with --overwrite."
-        if changed:
-            expected, got = (", ".join(f"{name}={one.get(name)!r}" for name in changed) for one in (before, now))
-            raise invalid("overwrite", expected=expected, got=got, cure=cure)
+        check_unchanged("overwrite", flatten(before if isinstance(before, dict) else {}), flatten(now), cure)
     state = jax.tree.map(np.array, load_part(Path(path), about))  # updated in place, so they must be its own
     if state.last_finite is None:
         state.last_finite = state.copy()

@@ -56,7 +56,7 @@ def save_video_model(
     Segments are written one after another, each with its own metadata. See `save_model`.
 
     The name ends in .safetensors, or has no extension. Raises ValueError for another one, `ModelFileError` for edits
-    that hold code: `apply`, `apply_triangles`, a camera that is a function.
+    that hold code: `apply`, a camera that is a function.
     """
     check_path(path, "path, model")
     require(

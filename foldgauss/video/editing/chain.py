@@ -52,7 +52,6 @@ from foldgauss.video.editing.edited_video import (
 from foldgauss.video.editing.overlays import (
     IDENTITY,
     LUMINANCE_WEIGHTS,
-    AbstractOverlay,
     Affine,
     GaussianFunction,
     Opacity,
@@ -61,7 +60,6 @@ from foldgauss.video.editing.overlays import (
     Retiming,
     SelectedGaussians,
     TimedEdit,
-    TriangleFunction,
     polar_decompose,
 )
 from foldgauss.video.editing.timing import NEVER, Clock, Span, TimeMap, When, frame_times_of, make_span
@@ -482,28 +480,10 @@ class Edit:
 
         **Example:** `edit(model).apply(lambda g, t: dataclasses.replace(g, mean=g.mean * (1 + t)))`
         """
-        return self._apply_function(GaussianFunction, function, "gaussians", when)
-
-    def apply_triangles(
-        self,
-        function: Callable[[Float[np.ndarray, "num 3 3"], float], Float[np.ndarray, "num 3 3"]],
-        **when: Unpack[When],
-    ) -> "Edit":
-        """Apply any function of the selection's triangles and the time t, from vertices (num, 3, 3) to vertices.
-
-        A Gaussian's triangle is V = [m, m + s1 r1, m + s2 r2], in (x, y, z); the Gaussian follows its vertices. The
-        video's camera shows triangles outside the plane z = 0 in perspective. Otherwise as `apply`.
-
-        **Source:** VeGaS eq:traingle_face, eq:gaussrecons1; GaMeS. **Raises:** ValueError, when rendered, for
-        triangles without area and for NaN or infinity.
-        """
-        return self._apply_function(TriangleFunction, function, "vertices", when)
-
-    def _apply_function(self, kind: type[AbstractOverlay], function: object, argument: str, when: When) -> "Edit":
         require(callable(function), "function", expected="a function", got=type(function).__name__)
-        check_signature("function", function, argument, "t")
+        check_signature("function", function, "gaussians", "t")
         function = function if self._time_map is None else self._time_map.convert_function(function)
-        return self._apply(partial(kind, function=function), when)
+        return self._apply(partial(GaussianFunction, function=function), when)
 
     # -------------------------------------------------------------------------------------------- 3D space
 

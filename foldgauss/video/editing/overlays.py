@@ -12,13 +12,11 @@ from typing import Any
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
 import scipy
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Bool, Float, Int
 
 from foldgauss._runtime.checks import check_one_of, require
-from foldgauss.render import Gaussians3D, Triangles
 from foldgauss.video.editing.arguments import static_numbers
 from foldgauss.video.editing.timing import Clock, Span
 
@@ -254,47 +252,6 @@ class GaussianFunction(AbstractOverlay):
         return after if progress == 1 else _interpolate(gaussians, after, progress)
 
 
-class TriangleFunction(AbstractOverlay):
-    """A function of the Gaussians' triangles: from vertices (num, 3, 3) and time to vertices. It cannot be saved.
-
-    Source: GaMeS; VeGaS eq:traingle_face.
-    """
-
-    function: Callable[[Float[np.ndarray, "num 3 3"], float], Float[np.ndarray, "num 3 3"]] = eqx.field(static=True)
-
-    def __call__(self, gaussians, t, progress):
-        flat = gaussians.in_space()
-        vertices = call_padded(_to_triangles, flat.mean, flat.factor)
-        moved = np.asarray(self.function(vertices.copy(), t))  # a copy: it may write to it
-        require(
-            moved.shape == vertices.shape and moved.dtype.kind in "fiu",
-            "vertices",
-            expected=f"numbers of shape {vertices.shape}",
-            got=f"{moved.dtype} {moved.shape}",
-        )
-        require(
-            np.isfinite(moved).all(),
-            "vertices",
-            expected="finite numbers",
-            got=f"NaN or infinity in {int((~np.isfinite(moved)).any((1, 2)).sum())} triangles",
-        )
-        if np.array_equal(moved, vertices):
-            return gaussians
-        moved = vertices + progress * (moved - vertices)
-        mean, factor = call_padded(_from_triangles, moved)
-        collinear = ~np.isfinite(factor).all((1, 2))
-        require(
-            not collinear.any(),
-            "vertices",
-            expected="triangles whose three vertices span a plane",
-            got=f"{collinear.sum()} without area, the first at index {np.append(collinear, True).argmax()}",
-            cure="Move a vertex off the line through the other two.",
-        )
-        if gaussians.mean.shape[1] == 2 and not moved[..., 2].any():
-            mean, factor = mean[:, :2], factor[:, :2]
-        return dataclasses.replace(gaussians, mean=mean, factor=factor)
-
-
 _MIN_PADDED_SIZE = 1024
 
 
@@ -302,7 +259,7 @@ def call_padded(function: Callable[..., Any], *arrays: Float[np.ndarray, "num ..
     """Call a compiled function that maps rows of arrays to rows, float32.
 
     The number of rows is padded to a power of two, so that compiled code is reused: by 0, or by unit matrices, which
-    are valid factors and triangles.
+    are valid factors.
     """
     num = len(arrays[0])
     size, padded = max(_MIN_PADDED_SIZE, 1 << (num - 1).bit_length()), []
@@ -310,20 +267,6 @@ def call_padded(function: Callable[..., Any], *arrays: Float[np.ndarray, "num ..
         fill = np.eye(*array.shape[1:]) if array.ndim == 3 else np.zeros(array.shape[1:])
         padded.append(np.concatenate([array, np.broadcast_to(fill, (size - num, *fill.shape))], dtype=np.float32))
     return jax.tree.map(lambda leaf: np.array(leaf)[:num], function(*padded))
-
-
-@jax.jit
-def _to_triangles(mean: Float[Array, "num 3"], factor: Float[Array, "num 3 2"]) -> Float[Array, "num 3 3"]:
-    """V = [m, m + s1 r1, m + s2 r2], from the two axes of the flat Gaussian."""
-    third = jnp.zeros_like(factor[..., :1])
-    flat = Gaussians3D(mean, jnp.concatenate([factor, third], -1), mean[:, 0], mean)
-    return Triangles.from_gaussians(flat).vertices
-
-
-@jax.jit
-def _from_triangles(vertices: Float[Array, "num 3 3"]) -> tuple[Float[Array, "num 3"], Float[Array, "num 3 2"]]:
-    flat = Triangles.from_vertices(vertices, vertices[:, 0, 0], vertices[:, 0]).to_gaussians()
-    return flat.mean, flat.factor[..., :2]
 
 
 def _check_result(before: SelectedGaussians, after: object) -> SelectedGaussians:

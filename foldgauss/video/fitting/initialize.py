@@ -160,17 +160,6 @@ def with_backdrop(splats: FoldedSplats, frames: UInt8[np.ndarray, "num_frames he
     return dataclasses.replace(splats, **made)
 
 
-def measure_lifetime(frames: UInt8[np.ndarray, "num_frames height width 3"], motion: Motion, degree: int) -> float:
-    """The mean number of frames in which the Gaussians of `initialize` are alive, if the frames are evenly spaced."""
-    rng, times = make_generator(Stream.LIFETIME), np.linspace(0, 1, len(frames))
-    envelope = TimeLikelihood(power=np.float32(1))
-
-    def make(home: np.ndarray, position: np.ndarray) -> tuple[FoldedSplats, np.ndarray]:
-        return make_splats(frames, home, position, times, degree, envelope, motion, rng, START_OPACITY)
-
-    return _try_starts(times, make, lambda k: measure_detail(frames[k]), rng)[1]
-
-
 def _try_starts(
     times: np.ndarray,
     make: Callable[[np.ndarray, np.ndarray], tuple[FoldedSplats, np.ndarray]],

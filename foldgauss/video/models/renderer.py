@@ -185,11 +185,10 @@ class VideoRenderer:
         self._background = check_background(background, model.compositing)
 
     def splats(self, t: float) -> Splats2D:
-        """The splats of the Gaussians alive at time t, in pixels of an image of `size`; NumPy leaves."""
-        return self._prepared.splats(t)
+        """The splats of the Gaussians alive at time t, in pixels of an image of `size`; NumPy leaves.
 
-    def dominant_splats(self, t: float) -> Splats2D:
-        """As `splats`, but of the nearer shot in the gap of a cut, and of the heavier image in a fade."""
+        In the gap of a cut they are those of the nearer shot, in a fade those of the heavier image.
+        """
         return max(self._prepared.weighted_splats(t), key=lambda part: part[0])[1]
 
     def frame(self, t: float) -> UInt8[np.ndarray, "height width channels"]:

@@ -2,7 +2,7 @@
 
 import dataclasses
 import itertools
-import logging
+import warnings
 
 import cv2
 import numpy as np
@@ -11,8 +11,6 @@ from jaxtyping import Bool, Float, Float16, Float32, UInt8
 from foldgauss._runtime.checks import require
 from foldgauss._runtime.threads import run_tasks
 from foldgauss.video.motion.optical_flow import both_flows, match_points
-
-_LOG = logging.getLogger(__name__)
 
 #: The longer side, in pixels, of the images that flow is computed on.
 SIDE = 480
@@ -119,9 +117,8 @@ def fill_background(frames: Frames, masks: Masks, *, alignment: Alignment | None
     """The frames without what the masks cover: other frames, moved as the background, show what is behind it.
 
     A pixel is the median of the frames that show it, up to `PLATE_REACH` frames away within its shot. One that no
-    frame shows is interpolated from its surroundings; the fraction of these is logged, at level INFO, or as a warning
-    if it is above `MUCH_UNKNOWN`. Pixels away from the masks stay as they are. `alignment` is that of the frames
-    (default: estimated here).
+    frame shows is interpolated from its surroundings, with a warning if their fraction is above `MUCH_UNKNOWN`. Pixels
+    away from the masks stay as they are. `alignment` is that of the frames (default: estimated here).
 
     Raises ValueError for frames of another type, and masks of another size.
     Example: `fill_background(frames, find_moving_object(frames, shadow=True))`.
@@ -155,17 +152,11 @@ def fill_background(frames: Frames, masks: Masks, *, alignment: Alignment | None
         filled[k][window] = (weight * plate + (1 - weight) * frames[k][window]).round()
 
     run_tasks(fill, [(k, shot) for shot in alignment.shots for k in range(*shot)])
-    _log_unknown(int(num_unknown.sum()), int(covered.sum()))
+    unknown, removed = num_unknown.sum(), covered.sum()
+    if unknown > MUCH_UNKNOWN * removed:
+        text = f"{unknown / removed:.0%} of the removed area is shown by no frame and filled from its surroundings."
+        warnings.warn(f"{text} It is a smear: take more frames, in which the object moves away from it.", stacklevel=2)
     return filled
-
-
-def _log_unknown(unknown: int, removed: int) -> None:
-    """Log how many of the removed pixels no frame shows."""
-    if removed:
-        much = unknown > MUCH_UNKNOWN * removed
-        cure = " It is a smear: take more frames, in which the object moves away from it." if much else ""
-        text = "%.0f%% of the removed area is shown by no frame and filled from its surroundings.%s"
-        _LOG.log(logging.WARNING if much else logging.INFO, text, 100 * unknown / removed, cure)
 
 
 def render_plate(

@@ -5,7 +5,7 @@ that the other frames show. GrabCut places the borders, the pieces are followed 
 the flow, and pixels near them are assigned by their color.
 """
 
-import logging
+import warnings
 
 import cv2
 import numpy as np
@@ -25,8 +25,6 @@ from foldgauss.video.motion.background_plate import (
     warp_by,
 )
 from foldgauss.video.motion.optical_flow import both_flows, pixel_grid, warp_image
-
-_LOG = logging.getLogger(__name__)
 
 #: Motion is measured over so many frames: slow objects need more, fast ones are not found again after many.
 GAPS = (1, 2, 4)
@@ -110,7 +108,7 @@ def find_moving_object(frames: Frames, *, shadow: bool = False, alignment: Align
     `frames` are uint8 (num_frames, height, width, 3), in which the background fills most of the image and moves as a
     plane does, about: a camera that turns, zooms, or passes a distant scene. Each shot has an object of its own, and
     objects that touch count as one. Masks are empty where it is hidden. `shadow`: with the shadow that it casts.
-    `alignment` is that of the frames (default: estimated here). Shots in which none is found are logged, at level INFO.
+    `alignment` is that of the frames (default: estimated here). Shots in which none is found raise a warning.
 
     It costs about half a second of processor time for each frame, of any size.
 
@@ -130,7 +128,7 @@ def find_moving_object(frames: Frames, *, shadow: bool = False, alignment: Align
         raise nothing_moves("an object that moves against the background", "none")
     missing = [f"{first}:{stop}" for first, stop in alignment.shots if not masks[first:stop].any()]
     if missing:
-        _LOG.info("No moving object was found in the shots of frames %s.", ", ".join(missing))
+        warnings.warn(f"No moving object was found in the shots of frames {', '.join(missing)}.", stacklevel=2)
     return masks
 
 

@@ -2,16 +2,14 @@
 
 import functools
 from collections.abc import Iterator
-from itertools import pairwise
 
-import cv2
 import numpy as np
 from jaxtyping import Float, UInt8
 
 from foldgauss.video.models.background import BLACK, Background
 from foldgauss.video.models.frame_times import is_cut
 from foldgauss.video.models.renderer import RenderedVideo, VideoRenderer
-from foldgauss.video.motion.optical_flow import Motion, both_flows, fit_size
+from foldgauss.video.motion.optical_flow import Motion
 
 #: Weight of the prediction by optical flow where both frames agree. Its errors and those of the video's own image are
 #: different, so an average is better than each, or as good.
@@ -20,12 +18,6 @@ FLOW_WEIGHT = 0.75
 HALVING_DIFFERENCE = 4000.0
 #: So near to a frame, in intervals, its own image is shown.
 NEAR = 1e-3
-#: A frame repeats the one before if less than this fraction of the motion beside the two is between them.
-REPEATED = 0.5
-#: Motion is steady if the product of the motions before and after is more than this fraction of the larger's square.
-ALIKE = 0.25
-#: Longer side, in pixels, of the images that this is measured on.
-COMPARED_SIDE = 240
 #: OpenCV moves images with fewer pixels than this on each side.
 MAX_SIDE = 2**15 - 1
 
@@ -72,25 +64,3 @@ def interpolate_frames(
                 weight = (FLOW_WEIGHT / (1 + predicted.difference / HALVING_DIFFERENCE))[..., None]
                 image = np.rint(image + weight * (np.clip(predicted.image, 0, 255) - image)).astype(np.uint8)
         yield image
-
-
-def even_durations(video: RenderedVideo) -> Float[np.ndarray, " intervals"]:
-    """The duration of each interval, in frames, with which frames that repeat the one before do not stutter.
-
-    It is 1, and where things move less than half as far as on average in the intervals before and after, in the same
-    directions, the fraction that they move. So a motion that speeds up, slows down, turns or begins is left as it is.
-    Measured by optical flow between the video's own images.
-
-    Example: `(even_durations(model) < 1).nonzero()[0] + 1`, the numbers of repeated frames.
-    """
-    size = fit_size(COMPARED_SIDE, *video.size)[::-1]
-    images = [cv2.cvtColor(frame, cv2.COLOR_RGB2GRAY) for frame in video.frames(size=size)]
-    flows = [both_flows(*pair)[0] for pair in pairwise(images)]
-    durations = np.ones(len(flows))
-    for k in range(1, len(flows) - 1):
-        before, here, after = flows[k - 1 : k + 2]
-        beside = (before + after) / 2
-        steady = np.vdot(before, after) > ALIKE * max(np.vdot(before, before), np.vdot(after, after))
-        moved = np.vdot(here, beside) / np.vdot(beside, beside) if steady else 1.0
-        durations[k] = max(moved, 0.0) if moved < REPEATED else 1.0
-    return durations

@@ -1,8 +1,8 @@
 """Selection criteria of a video in segments: evaluated per segment, and propagated over the frames that they share."""
 
 import dataclasses
-import logging
 import operator
+import warnings
 from collections import deque
 from collections.abc import Callable
 from typing import Any
@@ -34,8 +34,6 @@ from foldgauss.video.selection.selectors import (
     by_polygon,
     by_time,
 )
-
-_LOG = logging.getLogger(__name__)
 
 #: A pixel of a shared frame shows an object if at least this fraction of its color is the object's contribution.
 _MIN_CONTRIBUTION = 0.5
@@ -99,14 +97,12 @@ class CriteriaEvaluator:
                 parts.append(self.select_none(number))
             else:
                 one = self.replay(number)
-                if function is by_motion:
-                    _LOG.info("Segment %d, whose first frame, 0, is frame %d of the clip:", number, segment.first)
                 own = arguments if positions is None else _own_arguments(positions, segment, one, **arguments)
                 try:
                     parts.append(self.evaluate_segment(one, lambda model, _, own=own: function(model, **own)))
                 except NothingMoves as error:
                     motionless.append(error)
-                    _LOG.info("%s", error)
+                    warnings.warn(f"Segment {number}, from frame {segment.first} on: {error}", stacklevel=2)
                     parts.append(self.select_none(number))
         if motionless and len(motionless) == len(parts):
             raise motionless[0]

@@ -16,7 +16,7 @@ from foldgauss.video.editing.edited_video import (
     gather_layer,
     stack_layers,
 )
-from foldgauss.video.editing.overlays import AbstractOverlay, GaussianFunction, Retiming, TriangleFunction, is_active
+from foldgauss.video.editing.overlays import AbstractOverlay, GaussianFunction, Retiming, is_active
 from foldgauss.video.editing.timing import NEVER, TimeMap, frame_times_of
 from foldgauss.video.models.shared_paths import join_paths
 from foldgauss.video.models.splats import FoldedSplats
@@ -122,7 +122,7 @@ def _convert_layer(layer: Layer, time_map: TimeMap) -> Layer:
 
 def _drop_unseen(layer: Layer, time_map: TimeMap) -> Layer:
     """Without the Gaussians that are not alive in the segment, unless a clock or a function may show them."""
-    functions = any(isinstance(overlay, GaussianFunction | TriangleFunction) for overlay in layer.overlays)
+    functions = any(isinstance(overlay, GaussianFunction) for overlay in layer.overlays)
     if layer.clocks or functions or layer.holds_frames:
         return layer
     times = np.clip(time_map.whole[[0, -1]] + [-_MARGIN, _MARGIN], 0.0, 1.0)
@@ -135,7 +135,7 @@ def _drop_unseen(layer: Layer, time_map: TimeMap) -> Layer:
 
 def _convert_overlay(overlay: AbstractOverlay, time_map: TimeMap) -> AbstractOverlay | None:
     """The overlay in the segment's time; None if it has no effect there."""
-    if isinstance(overlay, GaussianFunction | TriangleFunction):
+    if isinstance(overlay, GaussianFunction):
         overlay = dataclasses.replace(overlay, function=time_map.convert_function(overlay.function))
     if overlay.span is None:
         return overlay

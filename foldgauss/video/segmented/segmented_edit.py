@@ -180,7 +180,7 @@ class SegmentedEdit:
     multiply, vanish, opacity = map(_record_method, ("multiply", "vanish", "opacity"))
     to_front, to_back, place = map(_record_method, ("to_front", "to_back", "place"))
     retime, freeze = map(_record_method, ("retime", "freeze"))
-    apply, apply_triangles, seen_from = map(_record_method, ("apply", "apply_triangles", "seen_from"))
+    apply, seen_from = map(_record_method, ("apply", "seen_from"))
 
     @functools.wraps(Edit.recolor)
     def recolor(self, color: ArrayLike | None = None, **kwargs: Any) -> "SegmentedEdit":

@@ -3,7 +3,6 @@
 import dataclasses
 import functools
 import inspect
-import logging
 import os
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -45,8 +44,6 @@ from foldgauss.video.selection.tracking import (
     settle_labels,
     to_lab,
 )
-
-_LOG = logging.getLogger(__name__)
 
 #: Fraction of a Gaussian's contribution that must lie inside a mask.
 THRESHOLD = 0.5
@@ -382,7 +379,7 @@ def by_motion(model: VideoModel, *, threshold: float = THRESHOLD) -> Selection:
     `find_moving_object` finds in the model's own images, to at least `threshold`.
 
     It is the largest object that moves against the background, in each shot. It takes about a second per frame. Shots
-    without one, and the number of Gaussians, are logged at level INFO.
+    without one raise a warning.
 
     **Example:** `edit(model).select(moving=True).vanish()`. **Raises:** `NothingMoves`, a ValueError, if nothing moves,
     or no Gaussian belongs to what does; and as `by_mask`.
@@ -390,7 +387,6 @@ def by_motion(model: VideoModel, *, threshold: float = THRESHOLD) -> Selection:
     check_model(model)
     if model.num_frames < LEAST_FRAMES:
         raise nothing_moves(f"a video of {LEAST_FRAMES} frames at least", model.num_frames)
-    _LOG.info("Searching for what moves against the background ...")
     scale = min(1.0, SIDE / max(model.size))
     size = tuple(max(1, round(side * scale)) for side in model.size)
     masks = find_moving_object(np.stack(list(model.frames(size=size))))
@@ -400,7 +396,6 @@ def by_motion(model: VideoModel, *, threshold: float = THRESHOLD) -> Selection:
         got = f"one that covers up to {area:,} of {masks[0].size:,} pixels of a frame, but to which no Gaussian belongs"
         cure = f"Lower the threshold, {threshold:g}, or select by a mask, a box or a click."
         raise nothing_moves("an object that has Gaussians of its own", got, cure)
-    _LOG.info("The moving object has %s of %s Gaussians.", f"{len(found):,}", f"{model.splats.num_gaussians:,}")
     return found
 
 
