@@ -98,13 +98,13 @@ _TRUSTED_FROM = 0.42
 #: Mean squared errors of a frame below this, in [0, 1], count as 0: its PSNR is at its maximum.
 _PERFECT = 1e-10
 #: The fraction of the gain of an action that is sure.
-_SURE = 0.3
+_SURE = 0.2
 #: Lambda R / D of a dropping for a PSNR in usual fits of a quality, with the bits of all that are kept then, and by
 #: which power of the fraction of the price it changes.
-_USUAL_COST = 1.4
+_USUAL_COST = 1.3
 _COST_POWER = -0.37
 #: Passes over the frames of usual fits; it falls with them where there are fewer.
-_USUAL_PASSES = 70.0
+_USUAL_PASSES = 60.0
 #: By how much more passes are left in a fit by minutes than its speed so far suggests: steps of fewer Gaussians, of
 #: which ever more are rounded, are faster.
 _SPEEDUP = 2.0
@@ -146,8 +146,8 @@ ACTIONS = (
     Action(0.1, "drop", 0.04, 4.0),
     Action(0.2, "drop", 0.16, 3.3),
     Action(0.3, "drop", 0.36, 2.5),
-    Action(0.42, "drop", 0.64, 1.9),
-    Action(0.55, "drop", 1.0, 1.1),
+    Action(0.42, "drop", 0.64, 2.4),
+    Action(0.55, "drop", 1.0, 1.3),
     Action(0.55, "sort"),
     Action(0.7, SHAPE, 0.4, 0.4),
     Action(0.78, SHAPE, 0.75),
