@@ -398,7 +398,7 @@ class FoldedGaussianMixture(ClassNamePrefixFeaturesOutMixin, TransformerMixin, D
         return len(self.weights_)
 
     def _call(self, method, x: np.ndarray) -> np.ndarray:
-        """A method of the mixture of scaled rows, at rows of X."""
+        """Call a method of the fitted mixture at rows of X, which are scaled first."""
         ordered = x[:, self._order_columns(x.shape[1])].astype(np.result_type(x, self._scaled.logits))
         return evaluate_rows(method, self._scaled, self._scaling.apply(ordered))
 

@@ -21,7 +21,7 @@ _NUM_BLOCKS = 8
 
 
 def evaluate_rows(method: Callable, mixture: FoldedMixture, y: Float[np.ndarray, "n d"]) -> np.ndarray:
-    """A method of a mixture of scaled rows, in NumPy arrays, at such rows."""
+    """Call a method of a mixture at scaled rows, in the dtype of the rows."""
     with enable_dtype(y.dtype):
         mixture = jax.tree.map(lambda z: jnp.asarray(z, y.dtype), mixture)
         return map_blocks(functools.partial(_call, method, mixture), y)
