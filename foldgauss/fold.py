@@ -327,7 +327,7 @@ class SharedPathFold(AbstractFold):
     def maps(self, t: Float[Array, "*#batch"]) -> Float[Array, "*#batch d-1 d"]:
         """The maps A(t) of the elements at times t; the identity for those on no path."""
         path = jnp.maximum(self.index - 1, 0)
-        before, after, fraction = locate(self.times[path], t)
+        before, after, fraction = locate(self.times, path, t)
         maps = (1 - fraction) * self.matrices[path, before] + fraction * self.matrices[path, after]
         return jnp.where(self.index > 0, maps, jnp.eye(*maps.shape, dtype=maps.dtype))
 

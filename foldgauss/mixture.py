@@ -235,7 +235,8 @@ class FoldedMixture(Mixture):
     def condition_time(self, t: Float[Array, "*#batch"]) -> Mixture:
         """Space at time t: the components at t, each with weight `w_k N(t; m_k, sigma_k^2)`, normalized.
 
-        So far from all m_k that all of these underflow, the components keep their own weights.
+        So far from all m_k that all of these underflow, the components keep their own weights. Its `mean` is E[s | t],
+        the regression of space on time, and its `covariance_matrix` Cov[s | t].
 
         **Shapes:** t (*batch,), broadcast; the result has `event_shape == (d-1,)`.
 
@@ -244,30 +245,6 @@ class FoldedMixture(Mixture):
         **Source:** eq:cond_dens and Bayes' rule.
         """
         return _at_time(self, as_value(t, self.dtype))
-
-    def expected_space(self, t: Float[Array, "*#batch"]) -> Float[Array, "*#batch d-1"]:
-        """E[s | t], the regression of space on time.
-
-            E[s | t] = sum_k w_k(t) (m_k + f_k(m_t,k - t)),   w_k(t) ~ w_k N(t; m_t,k, sigma_k^2)
-
-        **Shapes:** t (*sample, *batch) -> (*sample, *batch, d-1).
-
-        **Example:** `mixture.expected_space(jnp.linspace(0.0, 1.0, 100))`
-
-        **Source:** eq:cond_dens, by total expectation.
-        """
-        return self.condition_time(t).mean
-
-    def space_covariance(self, t: Float[Array, "*#batch"]) -> Float[Array, "*#batch d-1 d-1"]:
-        """Cov[s | t]: the mean covariance of the components at t, plus the covariance of their centers.
-
-        **Shapes:** t (*sample, *batch) -> (*sample, *batch, d-1, d-1).
-
-        **Example:** `mixture.space_covariance(0.25)`
-
-        **Source:** eq:cond_dens, by total covariance.
-        """
-        return self.condition_time(t).covariance_matrix
 
     def time_given_space(self, s: Float[Array, "*#batch d-1"]) -> Mixture:
         """The density of time given space, p(t | s) = sum_k P(k | s) p_k(t | s), by quadrature.

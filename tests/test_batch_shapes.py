@@ -57,7 +57,7 @@ def _moments(dist):
 
 def _of_mixture(m, x):
     t = x[..., 2]
-    return [*_pairs(m, x), m.expected_space(t), m.space_covariance(t), m.marginal([1, -1]).log_prob(x[..., 1:])]
+    return [*_pairs(m, x), *m.condition_time(t).moments(), m.marginal([1, -1]).log_prob(x[..., 1:])]
 
 
 def _of_mixture_at_times(m, x):

@@ -114,18 +114,6 @@ def test_tables_for_a_full_disk_are_kept(work, done, tmp_path, monkeypatch, no_p
     assert table_of(kept) == table_of(done)
 
 
-def test_without_colors_less_is_known(work, done, tmp_path, no_pictures):
-    target = tmp_path / "results"
-    assert run(*arguments(work, target, *SHORT, "--steps", "60", "--level", "colors")) == 0
-    told = (target / "summary.md").read_text()
-    assert "their colors are integrated out" in told
-    assert "their colors" not in (done / "summary.md").read_text()
-    wider = [float(one["exact_std"]) / float(other["exact_std"]) for one, other in zip(
-        table_of(target)[5:9], table_of(done)[5:9], strict=True)]  # fmt: skip
-    assert min(wider) > 0.9
-    assert max(wider) > 1.02
-
-
 def test_more_steps_go_on_and_overwriting_starts_anew(work, tmp_path, no_pictures):
     target = tmp_path / "results"
     few = ["--steps", "60", "--ensembles", "2"]

@@ -307,7 +307,6 @@ WRONG = [
     ),
     # uncertainty
     (f"{TIMES} o --noise white", 2, "--noise: expected one of 'score', 'independent'"),
-    (f"{TIMES} o --level c", 2, "--level: expected one of 'splats', 'colors'"),
     (f"{TIMES} o --concentration 0", 2, "--concentration: expected a number >= 1"),
     (f"{TIMES} o --ensembles 1", 2, "--ensembles: expected at least 2"),
     (f"{TIMES} o --steps 3", 2, "--steps: expected a whole number >= 10"),

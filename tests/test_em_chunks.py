@@ -3,7 +3,6 @@
 import subprocess
 import sys
 import warnings
-import weakref
 
 import numpy as np
 import pytest
@@ -12,7 +11,7 @@ pytest.importorskip("sklearn")
 from sklearn.exceptions import ConvergenceWarning
 
 from foldgauss.estimator import chunks as _chunks
-from foldgauss.estimator.chunks import is_chunked, open_chunks, summarize_rows, weighted_moments
+from foldgauss.estimator.chunks import Chunks, is_chunked, summarize_rows, weighted_moments
 from foldgauss.estimator.em import initialization, loop, statistics
 from foldgauss.estimator.folded_gaussian_mixture import FoldedGaussianMixture
 
@@ -132,6 +131,7 @@ def test_chunks_equal_one_array(options):
 
 
 def test_all_kinds_of_chunks_are_equivalent(tmp_path):
+    array = pytest.importorskip("dask.array", reason="dask is not installed")
     x, weights = _tracks(), _weights()
     parts, masses = np.split(x, CUTS), np.split(weights, CUTS)
     x.tofile(tmp_path / "rows")
@@ -141,6 +141,10 @@ def test_all_kinds_of_chunks_are_equivalent(tmp_path):
         "an object": (_Files(parts), _Files(masses)),
         "one chunk from a file": ([mapped], [weights]),
         "slices of a file, and a list": ([mapped[:7], mapped[7:]], [list(weights[:7]), weights[7:]]),
+        "blocks of a dask array": (
+            array.from_array(x, chunks=((70, 10, 0, 160, 1, 259, 100), 2)).blocks.ravel(),
+            array.from_array(weights, chunks=((70, 10, 0, 160, 1, 259, 100),)).blocks.ravel(),
+        ),
         "rows one by one": ([row[None] for row in x], weights[:, None]),
         "lists of rows in an object": (
             _Files([part.tolist() for part in parts if len(part)]),
@@ -207,11 +211,11 @@ def test_a_fit_continues_with_chunks():
 def test_variances_are_accurate_far_from_zero():
     x = 1e8 + np.random.default_rng(0).normal(size=(1000, 2)) * [1.0, 1e-3]
     weights = _weights(1000)
-    found, sizes = summarize_rows(open_chunks(np.array_split(x, 77), np.array_split(weights, 77)))
+    found = summarize_rows(Chunks(np.array_split(x, 77), np.array_split(weights, 77)))
     mean, variance = weighted_moments(x[weights > 0], weights[weights > 0])
     np.testing.assert_allclose(found.mean, mean, rtol=1e-15)
     np.testing.assert_allclose(found.variance, variance, rtol=1e-5)
-    assert (found.num_rows, found.size, sizes) == (1000, (weights > 0).sum(), [(weights > 0).sum()])
+    assert (found.num_rows, found.size) == (1000, (weights > 0).sum())
     np.testing.assert_allclose(found.total, weights.sum())
 
 
@@ -231,82 +235,6 @@ def test_predictions_of_chunks_equal_those_of_rows():
         np.testing.assert_allclose(np.concatenate(found), expected, atol=1e-12)
     labels = FoldedGaussianMixture(**OPTIONS).fit_predict(parts)
     np.testing.assert_array_equal(np.concatenate(list(labels)), fitted.predict(x))
-
-
-# --- dask -----------------------------------------------------------------------------------------------------
-
-
-def _dask():
-    return pytest.importorskip("dask.array", reason="dask is not installed")
-
-
-def test_dask_array_equals_one_array():
-    array = _dask()
-    x, weights = _tracks(offset=1e6), _weights()
-    rows = array.from_array(x, chunks=((70, 10, 0, 160, 1, 259, 100), 2))
-    whole = _fit(x, weights)
-    for mass in (weights, array.from_array(weights, chunks=77)):
-        _assert_same(whole, _fit(rows, mass))
-    for name in ("score", "bic"):
-        np.testing.assert_allclose(getattr(whole, name)(rows), getattr(whole, name)(x), rtol=1e-12)
-    for name in ("score_samples", "predict", "predict_proba"):
-        lazy, expected = getattr(whole, name)(rows), getattr(whole, name)(x)
-        assert isinstance(lazy, array.Array)
-        assert (lazy.dtype, lazy.shape, lazy.chunks[0]) == (expected.dtype, expected.shape, rows.chunks[0])
-        np.testing.assert_allclose(lazy.compute(), expected, atol=1e-9)
-
-
-def test_dask_does_not_hold_all_chunks():
-    array, dask = _dask(), pytest.importorskip("dask")
-    alive, most = [0], [0]
-
-    def gone():
-        alive[0] -= 1
-
-    def made(block_info=None):
-        rows = _tracks(20)
-        weakref.finalize(rows, gone)
-        alive[0] += 1
-        most[0] = max(most[0], alive[0])
-        return rows
-
-    rows = array.map_blocks(made, chunks=((20,) * 30, (2,)), dtype=np.float64, meta=np.zeros((0, 0)))
-    with dask.config.set(scheduler="threads", num_workers=2):
-        _fit(rows, max_iter=2)
-    assert most[0] < 10
-
-
-def _workers(**options):
-    distributed = pytest.importorskip("distributed", reason="distributed is not installed")
-    return distributed.Client(n_workers=2, threads_per_worker=1, dashboard_address=":0", **options)
-
-
-def test_workers_give_equal_bits():
-    rows = _dask().from_array(_tracks(), chunks=(101, 2))
-    alone = _fit(rows, _weights())
-    with _workers(processes=False) as client:
-        with pytest.importorskip("distributed").get_task_stream(client) as stream:
-            parted = _fit(rows, _weights())
-        # A summary, the rows of the starts, and a pass for each step.
-        assert len(stream.data) >= len(rows.chunks[0]) * (2 + parted.n_iter_)
-        np.testing.assert_allclose(alone.score(rows), alone.score(_tracks()), rtol=1e-12)
-    for name in FITTED:
-        np.testing.assert_array_equal(getattr(parted, name), getattr(alone, name))
-
-
-@pytest.mark.slow
-def test_worker_processes_give_equal_bits(monkeypatch):
-    monkeypatch.undo()  # processes have their own constants
-    rows = _dask().from_array(_tracks(200_000, np.float32), chunks=(66_000, 2))
-    options = {"max_iter": 5}
-    alone = _fit(rows, **options)
-    with _workers(processes=True) as client:
-        with_workers = _fit(rows, **options)
-        again = _fit(client.persist(rows), **options)
-        np.testing.assert_array_equal(alone.predict(rows).compute(), alone.predict(_tracks(200_000, np.float32)))
-    for name in FITTED:
-        np.testing.assert_array_equal(getattr(with_workers, name), getattr(alone, name))
-        np.testing.assert_array_equal(getattr(again, name), getattr(alone, name))
 
 
 # --- errors ---------------------------------------------------------------------------------------------------
@@ -353,31 +281,6 @@ def test_rows_that_change_between_passes_raise():
         _fit(_Changing(left))
 
 
-def test_invalid_dask_arrays_raise():
-    array = _dask()
-    rows = array.from_array(X, chunks=(20, 1))
-    for data, weights, match in [
-        (rows, None, r"X: expected a dask array chunked along rows alone, .* X.rechunk\(\{1: -1\}\)"),
-        (
-            rows.rechunk((20, 2))[rows[:, 0] > 0],
-            None,
-            "X: expected a dask array of known chunks, .*compute_chunk_sizes",
-        ),
-        (rows[:, 0], None, r"X: expected a dask array \(n, d\), got 1 dimensions"),
-        (rows.to_delayed().ravel()[0], None, "X: expected a dask array, got dask's Delayed"),
-        (rows.rechunk((20, 2)), np.ones(49), "sample_weight: expected shape"),
-        (rows.rechunk((20, 2)), array.ones(49), "sample_weight: expected shape"),
-        (rows.rechunk((20, 2)), [np.ones(50)], "sample_weight: expected shape"),
-        (
-            array.from_array(np.where(X[45] == X, np.nan, X), chunks=(20, 2)),
-            None,
-            "X, chunk 2 contains NaN",
-        ),
-    ]:
-        with pytest.raises(ValueError, match=match):
-            _fit(data, weights)
-
-
 def test_prediction_checks_chunks():
     fitted = _fit(_tracks(), max_iter=1)
     with pytest.raises(ValueError, match="X, chunk 1: expected 2 columns, got 1"):
@@ -386,8 +289,6 @@ def test_prediction_checks_chunks():
         next(fitted.predict([_NAN]))
     with pytest.raises(ValueError, match="X: expected at least one chunk with rows"):
         fitted.bic(_Files([]))
-    with pytest.raises(ValueError, match="X: expected 2 columns, got 1"):
-        fitted.predict(_dask().from_array(X[:, :1]))
 
 
 def test_rows_and_chunks_are_told_apart():
@@ -432,7 +333,6 @@ for num in (40, 640):
     fitted.fit(Chunks(num))
     fitted.score(Chunks(num))
     peaks.append(peak_bytes())
-assert "dask" not in sys.modules
 print(peaks[1] - peaks[0])
 """
 

@@ -82,10 +82,10 @@ def test_a_mixture_that_does_not_bend_is_scipys(x64):
     np.testing.assert_allclose(at.weights, weights / weights.sum(), rtol=1e-12)
     weights = weights / weights.sum()
     center = weights @ means[:, :2]
-    np.testing.assert_allclose(mixture.expected_space(0.3), center, rtol=1e-12)
+    np.testing.assert_allclose(mixture.condition_time(0.3).mean, center, rtol=1e-12)
     between = np.einsum("k,ki,kj->ij", weights, means[:, :2] - center, means[:, :2] - center)
     expected = np.tensordot(weights, covariances[:, :2, :2], 1) + between
-    np.testing.assert_allclose(mixture.space_covariance(0.3), expected, rtol=1e-11)
+    np.testing.assert_allclose(mixture.condition_time(0.3).covariance_matrix, expected, rtol=1e-11)
 
 
 KINDS = {
@@ -270,7 +270,7 @@ def test_a_mean_whose_components_are_too_far_apart():
 def test_the_mean_is_infinite_where_a_fold_overflows():
     """At t = 1e20 the widest component has all the weight; its fold, of degree 3, exceeds float32."""
     components = _components(fold=PolynomialFold(np.ones((3, 3, 2), np.float32)))
-    mean = FoldedMixture(components, weights=WEIGHTS).expected_space(jnp.array([-1e20, 1e20], jnp.float32))
+    mean = FoldedMixture(components, weights=WEIGHTS).condition_time(jnp.array([-1e20, 1e20], jnp.float32)).mean
     np.testing.assert_array_equal(mean, [[np.inf, np.inf], [-np.inf, -np.inf]])
 
 
@@ -323,7 +323,7 @@ def test_weights_of_zero_have_finite_gradients():
     by_weights = lambda w: FoldedMixture(components, weights=w).log_prob(x).sum()  # noqa: E731
     gradient = jax.jit(jax.grad(by_weights))(jnp.array([0.7, 0.0, 0.3]))
     assert np.isfinite(gradient).all()
-    by_time = lambda w: FoldedMixture(components, weights=w).expected_space(0.4).sum()  # noqa: E731
+    by_time = lambda w: FoldedMixture(components, weights=w).condition_time(0.4).mean.sum()  # noqa: E731
     assert np.isfinite(jax.jit(jax.grad(by_time))(jnp.array([0.7, 0.0, 0.3]))).all()
 
 
@@ -500,8 +500,8 @@ def test_draws_are_of_their_component_where_the_fold_is_a_function():
 
 
 def test_nan_asked_is_nan_answered():
-    assert jnp.isnan(_mixture().expected_space(jnp.nan)).all()
-    assert jnp.isnan(_mixture().space_covariance(jnp.nan)).all()
+    assert jnp.isnan(_mixture().condition_time(jnp.nan).mean).all()
+    assert jnp.isnan(_mixture().condition_time(jnp.nan).covariance_matrix).all()
     assert jnp.isnan(_mixture().condition([2], [jnp.nan]).weights).all()
 
 

@@ -23,7 +23,6 @@ class Stream(enum.IntEnum):
     ROUNDING_ORDER = 13
     SENSITIVITY_PROBE = 14
     SKETCH = 16
-    COLOR_PROBE = 17
     REFIT = 18
     RESAMPLED_FRAME = 19
     WALKERS = 20

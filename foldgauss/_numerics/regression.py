@@ -1,4 +1,4 @@
-"""Weighted polynomial regression of space on time, by QR in Hermite polynomials: arrays in, arrays out."""
+"""Polynomials of time: weighted regression of space on time, by QR in Hermite polynomials, and shifts of time."""
 
 import math
 from typing import NamedTuple
@@ -48,6 +48,17 @@ def hermite_to_powers(degree: int) -> np.ndarray:
     for k in range(degree + 1):
         matrix[: k + 1, k] = hermite_e.herme2poly(np.eye(degree + 1)[k][: k + 1]) / math.sqrt(math.factorial(k))
     return matrix
+
+
+def shift_polynomial(
+    coefficients: Float[Array, "*batch k dim"], shift: Float[Array, "*batch"]
+) -> list[Float[Array, "*batch dim"]]:
+    """Rows of the coefficients of p(v + shift), of the powers of v, from those of p; of JAX or NumPy arrays."""
+    rows = [coefficients[..., j, :] for j in range(coefficients.shape[-2])]
+    for start in range(len(rows) - 1):  # Taylor's shift by Horner's scheme
+        for j in reversed(range(start, len(rows) - 1)):
+            rows[j] = rows[j] + shift[..., None] * rows[j + 1]
+    return rows
 
 
 def weighted_regression(

@@ -7,6 +7,7 @@ from jax import lax
 from jaxtyping import Array, Float
 
 from foldgauss._numerics.batch import broadcast_leaves, compile_eager, concrete_value, map_over_batch
+from foldgauss._numerics.triangular import log_det
 from foldgauss._runtime.checks import require
 from foldgauss.analysis.moments import mean_log_envelope
 from foldgauss.analysis.quadrature import (
@@ -100,8 +101,7 @@ def _kl_gaussian(p: Gaussian, q: Gaussian):
 
 def _trace_and_log_det(tril_p, tril_q):
     """|L_q^-1 L_p|^2, the trace of Sigma_q^-1 Sigma_p, and log det Sigma_q - log det Sigma_p."""
-    log_diagonal = lambda tril: jnp.log(jnp.diagonal(tril, axis1=-2, axis2=-1)).sum(-1)  # noqa: E731
-    return (_solve(tril_q, tril_p) ** 2).sum((-2, -1)), 2 * (log_diagonal(tril_q) - log_diagonal(tril_p))
+    return (_solve(tril_q, tril_p) ** 2).sum((-2, -1)), log_det(tril_q) - log_det(tril_p)
 
 
 def _solve(tril, b):

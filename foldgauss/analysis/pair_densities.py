@@ -15,7 +15,7 @@ from jaxtyping import Array, Float
 from foldgauss._numerics.batch import align_leaves, jvp_of_moving, ranked_leaves
 from foldgauss._numerics.triangular import UNROLLED_SIZE, solve_lower
 from foldgauss.envelope import AbstractEnvelope, TimeLikelihood
-from foldgauss.gaussian import Gaussian
+from foldgauss.gaussian import Gaussian, half_log_det
 
 _HALF_LOG_2PI = 0.5 * float(np.log(2 * np.pi))
 
@@ -83,8 +83,7 @@ def _values(dist, rows: Array) -> Array:
     root = jnp.exp(jnp.clip(-0.5 * at.log_scale, -largest, largest))[..., None]
     z = [y * root * root for y in solve_lower(at.base_tril, residual)]
     half_square = sum(0.5 * y * y for y in z)[..., 0]
-    log_det = jnp.log(jnp.diagonal(at.base_tril, axis1=-2, axis2=-1)).sum(-1) + len(x) * at.log_scale
-    log_density = -(half_square + log_rest) - (log_det + len(x) * _HALF_LOG_2PI)
+    log_density = -(half_square + log_rest) - (half_log_det(at) + len(x) * _HALF_LOG_2PI)
     # NaN from inf - inf or 0 * inf means far away, -inf; NaN of the input propagates.
     reached = jnp.where((half_square < jnp.inf) & (log_rest < jnp.inf), log_density, -jnp.inf)
     return reached + _nan_of([(rows[None], 1)]) + _nan_of(ranked_leaves(dist))

@@ -1,19 +1,14 @@
 """Chunks of rows, for data larger than memory: read anew in every pass, one piece at a time.
 
-A source of chunks is a dask array, or an iterable of arrays that can be iterated repeatedly (a list of `np.memmap`, an
-object whose `__iter__` reads files). A pass runs a task, a function of pieces. That of a dask array runs once for each
-of its chunks, by dask's scheduler; results come in the order of the rows. dask is imported only if the rows are a dask
-array.
+A source of chunks is an iterable of arrays that can be iterated repeatedly: a list of `np.memmap`, the blocks of a dask
+array, an object whose `__iter__` reads files.
 """
 
-import functools
-import itertools
-import sys
-from collections.abc import Iterable, Iterator, Mapping, Sequence, Set
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence, Set
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from sklearn.utils import assert_all_finite, check_array
 
 from foldgauss._runtime.checks import require
@@ -32,9 +27,7 @@ class Piece(NamedTuple):
 
 
 def is_chunked(X) -> bool:
-    """Whether X is chunks of rows rather than rows, decided without reading any and without importing dask."""
-    if _is_dask(X):
-        return True
+    """Whether X is chunks of rows rather than rows, decided without reading any."""
     if any(hasattr(X, name) for name in ("__array__", "__array_interface__", "__dataframe__", "shape")):
         return False
     if isinstance(X, Sequence) and not isinstance(X, str | bytes):
@@ -42,41 +35,20 @@ def is_chunked(X) -> bool:
     return isinstance(X, Iterable) and not isinstance(X, str | bytes | Mapping | Set)
 
 
-def open_chunks(X, sample_weight=None, width: int | None = None) -> "IterableChunks | DaskChunks":
-    """The source of the chunks X; `width` is the number of columns if it is known.
+class Chunks:
+    """Rows in chunks and their weights: iteration is a pass over all rows, in pieces.
 
-    `sample_weight` has the chunks of X. For a dask array it may also be a single array.
-
-    **Raises:** ValueError if X can be iterated only once, or is a dask array whose chunks are unknown or split rows.
-    """
-    return (DaskChunks if _is_dask(X) else IterableChunks)(X, sample_weight, width)
-
-
-class IterableChunks:
-    """Chunks from an iterable of arrays, read in a single part.
-
-    `run(task, *arguments, each)` runs `task(pieces, *arguments)`, or `task(pieces, each[part], *arguments)`, on every
-    part; results in order. `map(function, fitted)` applies `function(fitted, x)`, of shape (n_i,) or
-    (n_i, num_columns), to each chunk.
+    `width` is the number of columns if it is known. `sample_weight` has the chunks of X. Raises ValueError if X can be
+    iterated only once, and in a pass if weights do not match or the number of rows has changed.
     """
 
-    concurrent = False  # whether several parts run at a time, perhaps in other processes
-
-    def __init__(self, X, sample_weight, width):
+    def __init__(self, X, sample_weight=None, width: int | None = None):
         _check_iterable("X", X)
         if sample_weight is not None:
             _check_iterable("sample_weight", sample_weight)
         self._chunks, self._weights, self.width, self._num_rows = X, sample_weight, width, None
 
-    def run(self, task, *arguments, each=None):
-        own = () if each is None else (each[0],)
-        yield task(self._read(), *own, *arguments)
-
-    def map(self, function, fitted, *, num_columns=None, dtype=None):
-        return (_map_chunk(function, fitted, self.width, x, number) for number, x in enumerate(self._chunks))
-
-    def _read(self) -> Iterator[Piece]:
-        """The pieces of all chunks, after checking that weights match and that passes have equal numbers of rows."""
+    def __iter__(self) -> Iterator[Piece]:
         row, of_chunks = 0, iter(() if self._weights is None else self._weights)
         for number, x in enumerate(self._chunks):
             own = None if self._weights is None else next(of_chunks, ())
@@ -94,96 +66,11 @@ class IterableChunks:
         )
         self._num_rows = row
 
-
-class DaskChunks:
-    """Chunks of a dask array, each a part, with `run` and `map` as those of `IterableChunks`.
-
-    dask's scheduler runs the parts: threads, or workers if a `dask.distributed` client is active. `map` returns a dask
-    array of `dtype`, by default float32 of float32 chunks and else float64.
-    """
-
-    concurrent = True
-
-    def __init__(self, X, sample_weight, width):
-        import dask.array
-
-        _check_dask(X)
-        require(
-            width in (None, X.shape[1]),
-            "X",
-            expected=f"{width} columns",
-            got=X.shape[1],
-            cure="Pass the columns of the fit.",
-        )
-        weights = dask.array.ones(len(X)) if sample_weight is None else dask.array.asanyarray(sample_weight)
-        require(
-            weights.shape == X.shape[:1], "sample_weight", expected=f"shape {X.shape[:1]}", got=f"shape {weights.shape}"
-        )
-        self._array, self.width = X, X.shape[1]
-        pairs = (X.to_delayed().ravel(), weights.rechunk(X.chunks[:1]).to_delayed())
-        self._delayed = list(zip(*pairs, strict=True))
-
-    def run(self, task, *arguments, each=None):
-        import dask
-
-        own = [() if each is None else (each[number],) for number in range(len(self._delayed))]
-        calls = (functools.partial(_run_part, task, k, self.width, own[k], arguments) for k in range(len(own)))
-        pairs = zip(calls, self._delayed, strict=True)
-        return iter(dask.compute(*(dask.delayed(call, traverse=False)(*data) for call, data in pairs)))
-
-    def map(self, function, fitted, *, num_columns=None, dtype=None):
-        one = functools.partial(_map_block, function, fitted, self.width)
-        dtype = np.dtype(dtype or (np.float32 if self._array.dtype == np.float32 else np.float64))
-        if num_columns is None:
-            return self._array.map_blocks(one, dtype=dtype, drop_axis=1, meta=np.zeros(0, dtype))
-        chunks = (self._array.chunks[0], (num_columns,))
-        return self._array.map_blocks(one, dtype=dtype, chunks=chunks, meta=np.zeros((0, 0), dtype))
-
-
-# --- dask -----------------------------------------------------------------------------------------------------
-
-
-def _is_dask(X) -> bool:
-    """Whether X is a dask collection, in which case dask is imported already."""
-    return "dask" in sys.modules and hasattr(X, "__dask_graph__")
-
-
-def _check_dask(X) -> None:
-    import dask.array
-
-    require(
-        isinstance(X, dask.array.Array),
-        "X",
-        expected="a dask array",
-        got=f"dask's {type(X).__name__}",
-        cure="For a dask DataFrame: .to_dask_array(lengths=True).",
-    )
-    require(X.ndim == 2, "X", expected="a dask array (n, d)", got=f"{X.ndim} dimensions")
-    require(
-        not np.isnan(X.shape).any(),
-        "X",
-        expected="a dask array of known chunks",
-        got="unknown sizes",
-        cure="X.compute_chunk_sizes() first.",
-    )
-    require(
-        X.numblocks[1] == 1,
-        "X",
-        expected="a dask array chunked along rows alone",
-        got=f"{X.numblocks[1]} chunks along the columns",
-        cure="X.rechunk({1: -1}) makes rows whole.",
-    )
-
-
-def _run_part(task, number, width, own, arguments, x, weights):
-    return task(_split_chunk(number, x, weights, width), *own, *arguments)
-
-
-def _map_block(function, fitted, width, x, block_info=None):
-    return _map_chunk(function, fitted, width, x, block_info[0]["chunk-location"][0])
-
-
-# --- iterables ------------------------------------------------------------------------------------------------
+    def map(self, function: Callable[[np.ndarray], np.ndarray]) -> Iterator[np.ndarray]:
+        """A function of rows applied to each chunk."""
+        for number, x in enumerate(self._chunks):
+            parts = [function(part) for part, _ in _split_chunk(number, x, None, self.width)]
+            yield np.concatenate(parts) if parts else function(np.zeros((0, self.width)))
 
 
 def _check_iterable(name: str, chunks) -> None:
@@ -202,6 +89,7 @@ def _split_chunk(number: int, x, weights, width: int | None) -> Iterator[Piece]:
     """Split a chunk to pieces of checked values; weights of None are 1."""
     name = f"X, chunk {number}"
     check_real(name, x)
+    x = np.asarray(x) if hasattr(x, "__array__") else x  # a block of a dask array is computed once
     require(
         weights is None or np.shape(weights)[:1] == (len(x),),
         f"sample_weight, chunk {number}",
@@ -232,14 +120,6 @@ def _split_chunk(number: int, x, weights, width: int | None) -> Iterator[Piece]:
         yield Piece(part, own)
 
 
-def _map_chunk(function, fitted, width: int, x, number: int):
-    parts = [function(fitted, part) for part, _ in _split_chunk(number, x, None, width)]
-    return np.concatenate(parts) if parts else function(fitted, np.zeros((0, width)))
-
-
-# --- tasks ----------------------------------------------------------------------------------------------------
-
-
 class RowSummary(NamedTuple):
     """Summary of all rows from one pass; rows of weight 0 count in `num_rows` only."""
 
@@ -261,47 +141,17 @@ def weighted_moments(x: Float[np.ndarray, "n d"], weights: Float[np.ndarray, " n
 
 
 @np.errstate(over="ignore", invalid="ignore")  # units out of range are refused elsewhere
-def summarize_rows(chunks: IterableChunks | DaskChunks) -> tuple[RowSummary, list[int]]:
-    """Summarize all rows in one pass; also the number of rows of positive weight in each part."""
-    parts = list(chunks.run(_summarize))
-    pieces = list(itertools.chain(*parts))
+def summarize_rows(chunks: Chunks) -> RowSummary:
+    """Summarize all rows in one pass."""
+    pieces = []
+    for x, weights in chunks:
+        present, total = weights > 0, float(weights.sum(dtype=np.float64))
+        moments = weighted_moments(x[present], weights[present]) if total > 0 else np.zeros((2, x.shape[1]))
+        pieces.append(RowSummary(len(x), int(present.sum()), total, *moments, x.dtype == np.float32))
     require(pieces, "X", expected="at least one chunk with rows", got="none", cure=_SOURCES)
     num_rows, sizes, totals, means, variances, single = map(np.array, zip(*pieces, strict=True))
     total = totals.sum()
     fractions = totals / total if total > 0 else totals
     mean = fractions @ means
     variance = fractions @ (variances + (means - mean) ** 2)  # within pieces and between them
-    summary = RowSummary(int(num_rows.sum()), int(sizes.sum()), float(total), mean, variance, bool(single.all()))
-    return summary, [sum(piece.size for piece in part) for part in parts]
-
-
-@np.errstate(over="ignore", invalid="ignore")  # units out of range are refused elsewhere
-def _summarize(pieces: Iterable[Piece]) -> list[RowSummary]:
-    """A summary of each piece."""
-    summaries = []
-    for x, weights in pieces:
-        present, total = weights > 0, float(weights.sum(dtype=np.float64))
-        moments = weighted_moments(x[present], weights[present]) if total > 0 else np.zeros((2, x.shape[1]))
-        summaries.append(RowSummary(len(x), int(present.sum()), total, *moments, x.dtype == np.float32))
-    return summaries
-
-
-def collect_rows(chunks, sizes: Sequence[int], indices: Int[np.ndarray, " m"] | None, prepare) -> tuple:
-    """The prepared rows with these indices among rows of positive weight (None: all), in ascending order."""
-    each = [None] * len(sizes)
-    if indices is not None:
-        firsts, indices = np.cumsum((0, *sizes)), np.sort(indices)
-        each = [indices[(a <= indices) & (indices < b)] - a for a, b in itertools.pairwise(firsts)]
-    parts = [part for parts in chunks.run(_collect, prepare, each=each) for part in parts]
-    return tuple(map(np.concatenate, zip(*parts, strict=True)))
-
-
-def _collect(pieces, indices, prepare):
-    parts, first = [], 0
-    for y, weights in map(prepare, pieces):
-        here = slice(None)
-        if indices is not None:
-            here = indices[(first <= indices) & (indices < first + len(y))] - first
-        parts.append((y[here], weights[here]))
-        first += len(y)
-    return parts
+    return RowSummary(int(num_rows.sum()), int(sizes.sum()), float(total), mean, variance, bool(single.all()))

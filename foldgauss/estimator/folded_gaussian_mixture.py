@@ -19,7 +19,7 @@ from sklearn.utils.validation import _check_sample_weight, check_is_fitted, vali
 
 from foldgauss._runtime.checks import is_integer, require, short_repr
 from foldgauss.envelope import Constant, TimeLikelihood
-from foldgauss.estimator.chunks import is_chunked, open_chunks, summarize_rows
+from foldgauss.estimator.chunks import Chunks, is_chunked, summarize_rows
 from foldgauss.estimator.em.components import Parameters
 from foldgauss.estimator.em.initialization import INITIALIZERS, draw_subset, initialize, restrict_covariances
 from foldgauss.estimator.em.loop import EMStatus, Run, run_em, select_best
@@ -35,12 +35,7 @@ from foldgauss.estimator.parameter_checks import (
     check_start,
     make_envelope,
 )
-from foldgauss.estimator.prediction import (
-    FittedMixture,
-    predict_components,
-    predict_log_prob,
-    predict_responsibilities,
-)
+from foldgauss.estimator.prediction import evaluate_rows
 from foldgauss.estimator.rows import (
     SMOOTH_ROWS,
     Rows,
@@ -77,10 +72,9 @@ class FoldedGaussianMixture(ClassNamePrefixFeaturesOutMixin, TransformerMixin, D
     `covariance_type="full"` and `degree=0` with `covariance_type="diag"` its "diag".
 
     **Data larger than memory:** in place of rows (n, d), X may be chunks of rows: an iterable of arrays (n_i, d) that
-    can be iterated repeatedly (such as a list), or a dask array chunked along its rows. `sample_weight` is then chunked
-    likewise. Every iteration reads all chunks once (twice with an envelope other than
-    "constant"): those of an iterable one after another, each chunk of a dask array as a task of dask's scheduler, on
-    workers if a `dask.distributed` client is active. The result equals that of the rows in one array, up to rounding.
+    can be iterated repeatedly (such as a list; of a dask array, `X.blocks.ravel()`). `sample_weight` is then chunked
+    likewise. Every iteration reads all chunks once (twice with an envelope other than "constant"), one after another.
+    The result equals that of the rows in one array, up to rounding.
 
     **Parameters:**
 
@@ -100,7 +94,7 @@ class FoldedGaussianMixture(ClassNamePrefixFeaturesOutMixin, TransformerMixin, D
     * `annealing`: the initial inverse temperature of EM, raised to 1 in 50 steps; 1 is no annealing. 0.1 separates
       crossing tracks from almost any start; well separated clusters are fitted better without.
     * `criterion`: "bic" or "aic", for "auto".
-    * `devices`: the number of JAX devices that the points are distributed over (1 for each task of a dask array).
+    * `devices`: the number of JAX devices that the points are distributed over.
 
     **dtype:** float32 data are fitted in float32, those with degrees above 6 or of units whose powers float32 does not
     hold, and all others, in float64, whatever JAX's default is.
@@ -225,14 +219,14 @@ class FoldedGaussianMixture(ClassNamePrefixFeaturesOutMixin, TransformerMixin, D
         """The rows after a first pass over them, and which of them have weight; None for chunks."""
         if chunked := is_chunked(X):
             vars(self).pop("feature_names_in_", None)
-            chunks, present = open_chunks(X, sample_weight), None
+            chunks, present = Chunks(X, sample_weight), None
         else:
             check_real("X", X)
             options = {"dtype": [np.float64, np.float32], "ensure_min_samples": 2}
             X = validate_data(self, X, ensure_all_finite=sample_weight is None, **options)
             weights = _check_sample_weight(sample_weight, X, dtype=X.dtype, ensure_non_negative=True)
-            chunks, present = open_chunks([X], [weights]), weights > 0
-        summary, sizes = summarize_rows(chunks)
+            chunks, present = Chunks([X], [weights]), weights > 0
+        summary = summarize_rows(chunks)
         require(not chunked or summary.num_rows >= 2, "X", expected="at least 2 rows", got=summary.num_rows)
         width = chunks.width
         least = 1 if self.n_components == "auto" else self.n_components
@@ -240,7 +234,7 @@ class FoldedGaussianMixture(ClassNamePrefixFeaturesOutMixin, TransformerMixin, D
         self.n_features_in_ = width
         dtype = np.dtype(np.float32 if summary.single else np.float64)
         unscaled = Scaling(np.zeros(width), np.ones(width))
-        return Rows(chunks, summary, sizes, self._order_columns(width), dtype, not chunked, unscaled), present
+        return Rows(chunks, summary, self._order_columns(width), dtype, not chunked, unscaled), present
 
     def _order_columns(self, num_columns: int) -> Int[np.ndarray, " d"]:
         return order_columns(self._time_index(num_columns), num_columns)
@@ -371,23 +365,28 @@ class FoldedGaussianMixture(ClassNamePrefixFeaturesOutMixin, TransformerMixin, D
         self.n_iter_, self.lower_bound_ = len(run.history), run.log_likelihood - self._scaling.log_volume
         self.lower_bounds_ = [value - self._scaling.log_volume for value in run.history]
 
-    # --- prediction: for chunks an iterator of arrays, for a dask array another, lazy one ----------------------
+    # --- prediction: for chunks an iterator of arrays -----------------------------------------------------------
 
     def score_samples(self, X) -> Float[np.ndarray, " n"]:
-        """log p(x) of each row, in the units of X; an iterator of arrays for chunks, a dask array for a dask array."""
-        return self._evaluate(predict_log_prob, X)
+        """log p(x) of each row, in the units of X; an iterator of arrays for chunks."""
+
+        def log_prob(x):
+            value = self._call(FoldedMixture.log_prob, x)
+            return value - value.dtype.type(self._scaling.log_volume)
+
+        return self._map_rows(log_prob, X)
 
     def score(self, X, y=None) -> float:
         """The mean of `score_samples`, over all chunks."""
         return self._mean_score(X)[0]
 
     def predict(self, X) -> Int[np.ndarray, " n"]:
-        """The most likely component of each row; an iterator of arrays for chunks, a dask array for a dask array."""
-        return self._evaluate(predict_components, X, dtype=np.int64)
+        """The most likely component of each row; an iterator of arrays for chunks."""
+        return self._map_rows(lambda x: self._call(FoldedMixture.responsibilities, x).argmax(1), X)
 
     def predict_proba(self, X) -> Float[np.ndarray, "n k"]:
-        """P(component | x) of each row; an iterator of arrays for chunks, a dask array for a dask array."""
-        return self._evaluate(predict_responsibilities, X, columns=True)
+        """P(component | x) of each row; an iterator of arrays for chunks."""
+        return self._map_rows(lambda x: self._call(FoldedMixture.responsibilities, x), X)
 
     def transform(self, X) -> Float[np.ndarray, "n k"]:
         """`predict_proba` of rows, as features named foldedgaussianmixture0, ... in the container of `set_output`."""
@@ -398,15 +397,18 @@ class FoldedGaussianMixture(ClassNamePrefixFeaturesOutMixin, TransformerMixin, D
     def _n_features_out(self) -> int:
         return len(self.weights_)
 
-    def _evaluate(self, function, X, dtype=None, columns: bool = False):
-        """Apply `function(fitted, x)` to the rows, or to each chunk; `dtype` and `columns` describe its results."""
+    def _call(self, method, x: np.ndarray) -> np.ndarray:
+        """Call a method of the fitted mixture at rows of X, which are scaled first."""
+        ordered = x[:, self._order_columns(x.shape[1])].astype(np.result_type(x, self._scaled.logits))
+        return evaluate_rows(method, self._scaled, self._scaling.apply(ordered))
+
+    def _map_rows(self, function, X):
+        """Apply a function to the rows, or to each chunk."""
         check_is_fitted(self)
-        fitted = FittedMixture(self._scaled, self._scaling, self._order_columns(self.n_features_in_))
         if is_chunked(X):
-            chunks, num = open_chunks(X, width=self.n_features_in_), len(self.weights_) if columns else None
-            return chunks.map(function, fitted, num_columns=num, dtype=dtype)
+            return Chunks(X, width=self.n_features_in_).map(function)
         check_real("X", X)
-        return function(fitted, validate_data(self, X, dtype=[np.float64, np.float32], reset=False))
+        return function(validate_data(self, X, dtype=[np.float64, np.float32], reset=False))
 
     def _mean_score(self, X, groups=None) -> tuple[float, int]:
         """The mean log p(x), and the number of rows, or of groups."""

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
-from jaxtyping import Array, ArrayLike, Bool, Float, Key
+from jaxtyping import Array, ArrayLike, Bool, Float
 
 from foldgauss._runtime.checks import is_integer, require
 from foldgauss.envelope import CallableEnvelope
@@ -37,16 +37,14 @@ def fit_gradient(
     sample_weight: Float[ArrayLike, " n"] | None = None,
     steps: int = 500,
     optimizer: optax.GradientTransformation | None = None,
-    batch_size: int | None = None,
-    key: Key[Array, ""] | None = None,
 ) -> GradientFit:
     """Maximize the (weighted) mean log-likelihood of points x over all parameters of a mixture, starting from it.
 
     Trained are weights, centers, covariances, times and the fold's leaves; of the envelope, those of a
     `CallableEnvelope` (a built-in envelope's power and floor are fixed). A component of weight 0 keeps it.
 
-    **Shapes:** x (n, d), time last; the mixture has no batch axes. `batch_size` points are drawn for each step with
-    `key` (default: all points in every step). `optimizer` is optax's, by default Adam with learning rate 0.01.
+    **Shapes:** x (n, d), time last; the mixture has no batch axes. `optimizer` is optax's, by default Adam with
+    learning rate 0.01.
 
     **Example:**
 
@@ -83,19 +81,11 @@ def fit_gradient(
         expected=f"{len(x)} numbers >= 0, not all 0",
         got=f"shape {weights.shape}",
     )
-    require(
-        batch_size is None or is_integer(batch_size, 1),
-        "batch_size",
-        expected="a whole number >= 1 or None",
-        got=repr(batch_size),
-    )
     optimizer = optax.adam(_LEARNING_RATE) if optimizer is None else optimizer
-    key = jax.random.key(0) if key is None else key
     raw = _init_raw(mixture)
     state, values, last = optimizer.init(raw), [], mixture
     for number in range(steps + 1):  # once more, since a step evaluates the parameters before it
-        step_key = jax.random.fold_in(key, number)
-        new, state, value, current, finite = _step(raw, state, mixture, x, weights, step_key, optimizer, batch_size)
+        new, state, value, current, finite = _step(raw, state, mixture, x, weights, optimizer)
         if not finite:
             message = f"The loss or a parameter was not finite in step {number + 1}: lower the learning rate."
             return GradientFit(last, np.array(values), False, message)
@@ -112,11 +102,7 @@ def _is_finite(mixture: FoldedMixture) -> Bool[Array, ""]:
 
 
 @eqx.filter_jit
-def _step(raw, state, start, x, weights, key, optimizer, batch_size):
-    if batch_size is not None:
-        rows = jax.random.choice(key, x.shape[0], (batch_size,), p=weights / weights.sum())
-        x, weights = x[rows], jnp.ones(batch_size, x.dtype)
-
+def _step(raw, state, start, x, weights, optimizer):
     def loss(raw):
         present = weights > 0
         log_p = _build_mixture(raw, start).log_prob(jnp.where(present[:, None], x, 0))

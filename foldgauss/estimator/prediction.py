@@ -1,17 +1,15 @@
-"""Evaluation of a fitted mixture at rows of X, in a form that can be sent to workers."""
+"""Evaluation of a fitted mixture at rows of X."""
 
 import functools
 import math
 from collections.abc import Callable
-from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float
 
 from foldgauss._numerics.batch import compile_eager
-from foldgauss.estimator.em.scaling import Scaling
 from foldgauss.estimator.em.statistics import enable_dtype
 from foldgauss.mixture import FoldedMixture
 
@@ -22,32 +20,10 @@ _MOST_ROWS = 2**16
 _NUM_BLOCKS = 8
 
 
-class FittedMixture(NamedTuple):
-    """A mixture of scaled rows, in NumPy arrays, and how rows of X become such."""
-
-    mixture: FoldedMixture
-    scaling: Scaling
-    order: Int[np.ndarray, " d"]
-
-
-def predict_log_prob(fitted: FittedMixture, x: Float[np.ndarray, "n d"]) -> Float[np.ndarray, " n"]:
-    value = _evaluate_rows(FoldedMixture.log_prob, fitted, x)
-    return value - value.dtype.type(fitted.scaling.log_volume)
-
-
-def predict_responsibilities(fitted: FittedMixture, x: Float[np.ndarray, "n d"]) -> Float[np.ndarray, "n k"]:
-    return _evaluate_rows(FoldedMixture.responsibilities, fitted, x)
-
-
-def predict_components(fitted: FittedMixture, x: Float[np.ndarray, "n d"]) -> Int[np.ndarray, " n"]:
-    return predict_responsibilities(fitted, x).argmax(1)
-
-
-def _evaluate_rows(method: Callable, fitted: FittedMixture, x: np.ndarray) -> np.ndarray:
-    """A method of the mixture at rows of X."""
-    y = fitted.scaling.apply(x[:, fitted.order].astype(np.result_type(x, fitted.mixture.logits)))
+def evaluate_rows(method: Callable, mixture: FoldedMixture, y: Float[np.ndarray, "n d"]) -> np.ndarray:
+    """Call a method of a mixture at scaled rows, in the dtype of the rows."""
     with enable_dtype(y.dtype):
-        mixture = jax.tree.map(lambda z: jnp.asarray(z, y.dtype), fitted.mixture)
+        mixture = jax.tree.map(lambda z: jnp.asarray(z, y.dtype), mixture)
         return map_blocks(functools.partial(_call, method, mixture), y)
 
 

@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float, Int
 from sklearn.exceptions import ConvergenceWarning
 
 from foldgauss._runtime.checks import invalid, require
-from foldgauss.estimator.chunks import DaskChunks, IterableChunks, Piece, RowSummary, collect_rows
+from foldgauss.estimator.chunks import Chunks, Piece, RowSummary
 from foldgauss.estimator.em.scaling import Scaling
 from foldgauss.estimator.em.statistics import Blocks, Points, make_points
 
@@ -34,9 +34,8 @@ class Rows(NamedTuple):
     Prepared are the rows of positive weight: time last, scaled, and the weights times `factor`.
     """
 
-    chunks: IterableChunks | DaskChunks
+    chunks: Chunks
     summary: RowSummary
-    sizes: list[int]
     order: Int[np.ndarray, " d"]
     dtype: np.dtype
     in_memory: bool
@@ -56,13 +55,20 @@ class Rows(NamedTuple):
         return self.summary.mean[self.order], self.summary.variance[self.order]
 
     def take(self, subset: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
-        """The prepared rows with these indices (None: all), and their weights."""
-        return collect_rows(self.chunks, self.sizes, subset, self.prepare)
+        """The prepared rows with these indices (None: all) in ascending order, and their weights."""
+        parts, first = [], 0
+        for y, weights in map(self.prepare, self.chunks):
+            here = slice(None)
+            if subset is not None:
+                here = np.sort(subset[(first <= subset) & (subset < first + len(y))]) - first
+            parts.append((y[here], weights[here]))
+            first += len(y)
+        return tuple(map(np.concatenate, zip(*parts, strict=True)))
 
     def to_points(self, num_components: int, devices: int) -> Points | Blocks:
         if self.in_memory:
             return make_points(*self.take(), num_components, devices)
-        return Blocks(self.chunks, self.prepare, self.dtype, num_components, self.sizes, devices)
+        return Blocks(self.chunks, self.prepare, self.dtype, num_components, self.summary.size, devices)
 
 
 def _prepare(order: Int[np.ndarray, " d"], scaling: Scaling, factor: float, dtype: np.dtype, piece: Piece) -> tuple:

@@ -19,7 +19,6 @@ import dataclasses
 import math
 
 import numpy as np
-import scipy
 
 from foldgauss._runtime.checks import require
 from foldgauss._runtime.threads import run_tasks
@@ -192,41 +191,6 @@ def backward(trace: Trace, grad_image: np.ndarray) -> tuple[np.ndarray, ...]:
 def background_gradient(trace: Trace, grad_image: np.ndarray) -> np.ndarray:
     """The gradient of the background, (channels,), given dL/dimage as for `backward`."""
     return np.einsum("chw,hw->c", grad_image, trace.transmittance, dtype=np.float32)
-
-
-def build_weight_matrix(trace: Trace) -> "scipy.sparse.csr_array":
-    r"""The weight of each splat at each pixel, alpha times transmittance: (height * width, num), float32.
-
-    $$ A_{pi} = \alpha_i(p) \prod_{j < i} (1 - \alpha_j(p)) $$
-
-    Rows are pixels in reading order; within a row splats are in array order, front to back. With compositing "sum" the
-    product is 1. Cutoff, ceiling and stop are those of the trace, so that `A @ color + transmittance * background` is
-    its image up to rounding, which may decide whether a weight at the cutoff is kept.
-
-    **Example:** `build_weight_matrix(forward(mean, factor, opacity, color, background, size))`.
-
-    **Source:** Kerbl et al. 2023, 3D Gaussian Splatting, eq. 3, which is linear in the colors.
-    """
-    size = trace.transmittance.shape
-    num_pixels = size[0] * size[1]
-    row_start, entries = trace.buckets[:2]
-
-    def walk(part: int, *outputs) -> None:
-        begin, _ = trace.parts[part]
-        lists = begin, entries[row_start[begin] :], *trace.lists[part][:3]
-        kernels.list_weights(*size, *lists, trace.geometry, *trace.constants[1:], *outputs)
-
-    parts = range(len(trace.parts))
-    indptr = np.zeros(num_pixels + 1, np.int64)
-    run_tasks(lambda part: walk(part, indptr[1:], None, None), parts)
-    np.cumsum(indptr, out=indptr)
-    indices, values = np.empty(indptr[-1], np.int32), np.empty(indptr[-1], np.float32)
-    run_tasks(lambda part: walk(part, indptr, indices, values), parts)
-    if indptr[-1] < np.iinfo(np.int32).max:  # SciPy's own choice: products of mixed index widths are copied first
-        indptr = indptr.astype(np.int32)
-    matrix = scipy.sparse.csr_array((values, indices, indptr), shape=(num_pixels, len(trace.geometry)))
-    matrix.has_sorted_indices = True
-    return matrix
 
 
 def raise_screen_gradients(largest: np.ndarray, trace: Trace, d_mean: np.ndarray, indices: np.ndarray) -> None:

@@ -13,7 +13,6 @@ from foldgauss.uncertainty.diagnostics.irregularities import (
     irregularities,
 )
 from foldgauss.uncertainty.diagnostics.report import frame_table, summary
-from foldgauss.uncertainty.likelihood.color_marginalization import marginalize_colors
 from foldgauss.uncertainty.likelihood.likelihood_profiles import LikelihoodProfiles, likelihood_profiles
 from foldgauss.uncertainty.likelihood.noise import FrameNoise
 from foldgauss.uncertainty.likelihood.profile_curves import ProfileCurves
@@ -39,7 +38,6 @@ __all__ = [
     "increment_intervals",
     "irregularities",
     "likelihood_profiles",
-    "marginalize_colors",
     "refit_frame_times",
     "summary",
 ]

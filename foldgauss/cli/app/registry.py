@@ -115,7 +115,6 @@ EXAMPLES: Mapping[str, Mapping[str, str]] = MappingProxyType(
             "Tables and figures into steady-uncertainty, of a model that was fitted with --no-follow-camera": (
                 "foldgauss uncertainty steady.safetensors holiday.mp4"
             ),
-            "With unknown colors": "foldgauss uncertainty steady.safetensors holiday.mp4 --level colors",
         },
         "tradeoff": {
             "In ten minutes, into holiday-tradeoff": "foldgauss tradeoff holiday.mp4",

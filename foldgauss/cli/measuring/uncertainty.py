@@ -26,7 +26,7 @@ from foldgauss.cli.shared.files import (
 from foldgauss.io._atomic import atomic_path, lock_output, translate_output_errors, write_or_keep
 from foldgauss.io.figures import write_figure
 from foldgauss.io.models.video_model import load_video_model, read_origin
-from foldgauss.uncertainty import frame_time_posterior, likelihood_profiles, marginalize_colors
+from foldgauss.uncertainty import frame_time_posterior, likelihood_profiles
 from foldgauss.uncertainty.diagnostics import plots
 from foldgauss.uncertainty.diagnostics.irregularities import irregularities
 from foldgauss.uncertainty.diagnostics.report import frame_table, summary
@@ -38,8 +38,6 @@ from foldgauss.video.models.video_model import VideoModel
 
 CHAINS = "chains.h5"
 PLOTS = ("times.png", "increments.png", "correlation.png")
-#: What the posterior is conditioned on: all splats, or all but their colors.
-LEVELS = ("splats", "colors")
 FILES = ("frame_times.csv", "summary.md", "posterior.nc", *PLOTS)
 #: Largest number of draws of each ensemble in posterior.nc, evenly spaced; all of them may take gigabytes.
 MAX_DRAWS = 4000
@@ -66,13 +64,6 @@ def uncertainty_command(
             autocompletion=complete_choice(NOISES),
         ),
     ] = "score",
-    level: Annotated[
-        str,
-        typer.Option(
-            help="Known parameters: splats, all of them; colors, all but the colors, which takes longer.",
-            autocompletion=complete_choice(LEVELS),
-        ),
-    ] = "splats",
     concentration: Annotated[
         float,
         typer.Option(
@@ -94,7 +85,6 @@ def uncertainty_command(
     for name in ("matplotlib", "emcee", "h5py", "h5netcdf", "arviz"):
         import_optional(name, "uncertainty")
     check_one_of("--noise", noise, NOISES)
-    check_one_of("--level", level, LEVELS)
     out_dir = name_after(model_path, "-uncertainty") if out_dir is None else out_dir
     refuse_inputs(out_dir / PLOTS[0], {"clip": video})  # plots would be frames there
     known, cure = overwrite or (out_dir / CHAINS).exists(), ", or start over with --overwrite"
@@ -126,9 +116,6 @@ def uncertainty_command(
         profiles = likelihood_profiles(
             model, clip.frames, noise=noise, on_render=lambda done, total: show("Rendering", done, total)
         )
-        if level == "colors":
-            on_frame = lambda done, total: show("Integrating colors", done, total)  # noqa: E731
-            profiles = marginalize_colors(model, clip.frames, profiles, on_frame=on_frame)
         settings = {"concentration": concentration, "ensembles": ensembles, "steps": steps, "seed": seed}
         if overwrite:
             (out_dir / CHAINS).unlink(missing_ok=True)

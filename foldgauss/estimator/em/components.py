@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from foldgauss._numerics.batch import cast
-from foldgauss._numerics.regression import hermite_to_powers
+from foldgauss._numerics.regression import hermite_to_powers, shift_polynomial
 from foldgauss._numerics.triangular import UNROLLED_SIZE, inverse_lower, log_det
 from foldgauss.envelope import AbstractEnvelope, Constant
 
@@ -71,15 +71,11 @@ def evaluate_densities(params: Parameters, envelope: AbstractEnvelope, x: Float[
 
 
 def change_variable(curve: Float[Array, "*batch q+1 dim"], shift, ratio) -> Float[Array, "*batch q+1 dim"]:
-    """The same curve in powers of v' where v = shift + ratio v', by the binomial theorem."""
-    degree = curve.shape[-2] - 1
-    rows = [curve[..., j, :] for j in range(degree + 1)]
-    for start in range(degree):  # Taylor's shift by Horner's scheme
-        for j in reversed(range(start, degree)):
-            rows[j] = rows[j] + shift[..., None] * rows[j + 1]
+    """The same curve in powers of v' where v = shift + ratio v'."""
     powers = [jnp.ones_like(ratio)]
-    for _ in range(degree):
+    for _ in range(curve.shape[-2] - 1):
         powers.append(powers[-1] * ratio)
+    rows = shift_polynomial(curve, shift)
     return jnp.stack([row * power[..., None] for row, power in zip(rows, powers, strict=True)], axis=-2)
 
 

@@ -25,7 +25,7 @@ from jaxtyping import Array, Float
 from foldgauss._numerics.batch import cast
 from foldgauss._numerics.regression import hermite_columns
 from foldgauss.envelope import AbstractEnvelope, Constant
-from foldgauss.estimator.chunks import DaskChunks, IterableChunks, Piece
+from foldgauss.estimator.chunks import Chunks, Piece
 from foldgauss.estimator.em.components import Densities, Parameters, evaluate_densities
 
 #: Densities of point and component held at once. Arrays of this many numbers stay in a core's cache.
@@ -98,14 +98,10 @@ def map_leading(function: Callable, *arguments):
     return jax.vmap(function)(*arguments)
 
 
-def map_chunks(function: Callable, arrays):
-    """Apply a function to each chunk of `arrays`, of leading axes (devices, chunks): on each device one at a time."""
-    return map_leading(lambda chunks: lax.map(function, chunks), arrays)
-
-
 def sum_chunks(function: Callable, arrays):
-    """The sum of a function of chunks over all of them."""
-    return jax.tree.map(lambda z: z.sum((0, 1)), map_chunks(function, arrays))
+    """The sum of a function of chunks over all of `arrays`, of leading axes (devices, chunks): on each device one at a
+    time."""
+    return jax.tree.map(lambda z: z.sum((0, 1)), map_leading(lambda chunks: lax.map(function, chunks), arrays))
 
 
 # --- points that are read piece by piece ----------------------------------------------------------------------
@@ -114,37 +110,25 @@ def sum_chunks(function: Callable, arrays):
 class Blocks(NamedTuple):
     """Points that are read anew in every pass; `prepare` converts a piece to scaled points and weights."""
 
-    chunks: IterableChunks | DaskChunks
+    chunks: Chunks
     prepare: Callable[[Piece], tuple[np.ndarray, np.ndarray]]
     dtype: np.dtype
     num_components: int
-    sizes: list[int]  # points in each part of the chunks
+    size: int  # points in all chunks
     devices: int = 1
 
 
 def sum_over_points(function: Callable, points: Points | Blocks, *arguments):
-    """`function(*arguments, points)`, compiled, of a function that is a sum over points; of blocks, in float64.
-
-    Blocks are added up in the order of their rows, so that who computed them makes no difference.
-    """
+    """`function(*arguments, points)`, compiled, of a function that is a sum over points; of blocks, in float64."""
     if isinstance(points, Points):
         return _compiled(function)(*arguments, points)
-    # Workers get NumPy arrays: JAX arrays belong to a process.
-    arguments = jax.tree.map(lambda z: np.asarray(z) if isinstance(z, jax.Array) else z, arguments)
-    devices = 1 if points.chunks.concurrent else points.devices
-    settings = (points.prepare, points.dtype, points.num_components, devices, function, arguments)
-    total = functools.reduce(_add, points.chunks.run(_sum_part, *settings, each=points.sizes))
-    return jax.tree.map(lambda z: jnp.asarray(z, points.dtype), total)
-
-
-def _sum_part(pieces: Iterable[Piece], size, prepare, dtype, num_components, devices, function, arguments):
     total, last = None, None
-    with enable_dtype(dtype):
-        for block in make_blocks(map(prepare, pieces), size, num_components, devices):
-            # JAX returns before the sums are computed: meanwhile the next block is read.
-            last, before = _compiled(function)(*arguments, block), last
-            total = _add(total, before)
-        return _add(total, last)
+    rows = map(points.prepare, points.chunks)
+    for block in make_blocks(rows, points.size, points.num_components, points.devices):
+        # JAX returns before the sums are computed: meanwhile the next block is read.
+        last, before = _compiled(function)(*arguments, block), last
+        total = _add(total, before)
+    return jax.tree.map(lambda z: jnp.asarray(z, points.dtype), _add(total, last))
 
 
 def _add(total, more):

@@ -62,9 +62,8 @@ class LikelihoodProfiles:
     """Log-likelihood curves of all frames as functions of their times, and the noise that they assume.
 
     `log_likelihood` (num_frames,): of each frame at the mode of its curve, where the curve is 0, in nats, without the
-    normalizing constant of the noise; NaN at level "colors". `residual_correlation` (lags,): correlation of residuals
-    by distance in pixels, averaged over frames. `num_rendered`: number of rendered images. `level`: "splats" if all
-    splats are held, "colors" if their colors are integrated out. `notes`: texts of the warnings.
+    normalizing constant of the noise. `residual_correlation` (lags,): correlation of residuals by distance in pixels,
+    averaged over frames. `num_rendered`: number of rendered images. `notes`: texts of the warnings.
     """
 
     curves: ProfileCurves
@@ -72,7 +71,6 @@ class LikelihoodProfiles:
     log_likelihood: Float64[np.ndarray, " num_frames"]
     residual_correlation: Float64[np.ndarray, " lags"]
     num_rendered: int
-    level: str = "splats"
     notes: tuple[str, ...] = ()
 
 

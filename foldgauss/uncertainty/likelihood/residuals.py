@@ -1,6 +1,6 @@
 """Residuals of a video: its frames less the images that a model renders at given times."""
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator
 
 import numba as nb
 import numpy as np
@@ -8,7 +8,7 @@ import scipy.sparse
 from jaxtyping import Float32, Float64, UInt8
 
 from foldgauss._numerics.random_streams import Stream, make_generator
-from foldgauss._runtime.checks import is_integer, require, short_repr
+from foldgauss._runtime.checks import require, short_repr
 from foldgauss._runtime.kernels import kernel
 from foldgauss._runtime.threads import run_tasks
 from foldgauss.video.editing.edited_video import EditedVideo
@@ -31,22 +31,6 @@ def check_model(model: VideoModel) -> None:
     elif isinstance(model, SegmentedVideo):
         cure = f"{ONE_SEGMENT} Its clip is that segment's frames."
     require(isinstance(model, VideoModel), "model", expected="a VideoModel", got=short_repr(model), cure=cure)
-
-
-def check_frames(frames: Sequence[int] | None, num_frames: int) -> list[int]:
-    """Different frames between the first and the last one, whose times are fixed; None: all of them."""
-    inner = range(1, num_frames - 1)
-    if frames is None:
-        return list(inner)
-    chosen = list(frames) if isinstance(frames, Sequence | np.ndarray) else []
-    require(
-        chosen and all(is_integer(k, 1) and k in inner for k in chosen) and len({*chosen}) == len(chosen),
-        "frames",
-        expected=f"different frames from 1 to {inner[-1]}",
-        got=short_repr(frames),
-        cure="The first frame is at 0 and the last at 1. One frame is `[k]`.",
-    )
-    return chosen
 
 
 class Residuals:

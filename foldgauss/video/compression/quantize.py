@@ -21,11 +21,12 @@ import math
 import numpy as np
 from jaxtyping import Bool, Float, Int, Int32
 
+from foldgauss._numerics.regression import shift_polynomial
 from foldgauss._runtime.checks import require
 from foldgauss.envelope import TimeLikelihood
 from foldgauss.render import RenderOptions
 from foldgauss.video.models.frame_times import FrameTimes
-from foldgauss.video.models.row_layout import MAX_DEGREE, shift_path
+from foldgauss.video.models.row_layout import MAX_DEGREE
 from foldgauss.video.models.shared_paths import SharedPaths, check_paths
 from foldgauss.video.models.splats import TAU_MAX, FoldedSplats
 from foldgauss.video.models.video_model import VideoModel
@@ -642,7 +643,7 @@ def _round_columns(
 def _compute_trajectories(exact: ExactColumns, decoded: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
     """The trajectory's columns: the same curve in time, relative to the m_t and the span that are decoded."""
     time = clamp_unit(decoded["time"])
-    polynomials = shift_path(exact.polynomials, time - exact.values["time"])
+    polynomials = np.stack(shift_polynomial(exact.polynomials, exact.values["time"] - time), 1)
     matrix = trajectory_matrix(time, decoded["duration"], exact.info)
     size = np.abs(matrix).max(2, keepdims=True)  # rows differ greatly in size: c_k scales with a power of time
     solved = np.linalg.solve(matrix / size, polynomials / size)

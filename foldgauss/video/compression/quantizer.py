@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32, Int, Int32, UInt8
 
 from foldgauss._numerics.random_streams import Stream, make_generator
+from foldgauss._numerics.regression import shift_polynomial
 from foldgauss._runtime.checks import require
 from foldgauss.render import cpu
 from foldgauss.video.compression.quantize import (
@@ -32,7 +33,7 @@ from foldgauss.video.compression.quantize import (
     trajectory_matrix,
 )
 from foldgauss.video.models.conditioning import backpropagate
-from foldgauss.video.models.row_layout import GROUPS, columns, shift_path
+from foldgauss.video.models.row_layout import GROUPS, columns
 from foldgauss.video.models.splats import FoldedSplats
 from foldgauss.video.models.video_model import VideoModel
 from foldgauss.video.selection.contributions import Contributions, FrameContributions
@@ -160,7 +161,7 @@ def round_groups(
     decoded, v = dequantize(quantized).splats, exact.values
     is_rounded = {name: (rounded & bit) > 0 for group, bit in GROUPS.items() for name in group}
     time = clamp_unit(np.where(is_rounded["time_loc_logit"], decode_values(quantized)["time"], v["time"]))
-    polynomials = shift_path(exact.polynomials, time - v["time"])
+    polynomials = np.stack(shift_polynomial(exact.polynomials, v["time"] - time), 1)
     leaves = {"loc": polynomials[:, 0], "coefficients": polynomials[:, 1:]}
     for name, which in is_rounded.items():
         own = leaves.get(name, np.asarray(getattr(model.splats, name)))
@@ -227,7 +228,7 @@ class _ColumnGradients:
         self._matrix = trajectory_matrix(v["time"], v["duration"], info)
         self._flip = np.where(exact.swapped, -1.0, 1.0)
         k = np.arange(1, info.degree + 1)[:, None]
-        # A later m_t with the same curve in time, see `shift_path`.
+        # A later m_t with the same curve in time, see `shift_polynomial`.
         self._by_time = np.concatenate([k * exact.polynomials[:, 1:], np.zeros((len(self._flip), 1, 2))], 1)
         trajectory = [f"{axis}{j}" for j in range(info.degree + 1) for axis in "xy"]
         self.names = ["size", "stretch", "duration", "opacity", "time", "angle", "luma", "blue", "green", *trajectory]

@@ -8,7 +8,7 @@ import dataclasses
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import UInt8
 
 from foldgauss.envelope import TimeLikelihood
 from foldgauss.video.models.shared_paths import SharedPaths
@@ -77,14 +77,3 @@ def unpack(rows: np.ndarray, degree: int, envelope: TimeLikelihood, paths: Share
         xp = np if isinstance(rows, np.ndarray) else jnp
         leaves |= {"path_index": rows[:, -1].astype(xp.uint8), "paths": paths}
     return FoldedSplats(**leaves, envelope=envelope)
-
-
-def shift_path(
-    place: Float[np.ndarray, "num degree+1 2"], shift: Float[np.ndarray, " num"]
-) -> Float[np.ndarray, "num degree+1 2"]:
-    """Coefficients of the same path in powers of u + shift, for an m_t later by `shift`."""
-    place, degree = place.copy(), place.shape[1] - 1
-    for j in range(degree):
-        for k in range(degree - 1, j - 1, -1):
-            place[:, k] -= shift[:, None] * place[:, k + 1]
-    return place

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, UInt8
 
-from foldgauss._numerics.piecewise import locate, locate_in_rows
+from foldgauss._numerics.piecewise import locate
 from foldgauss._runtime.checks import require
 from foldgauss.render import Splats2D
 
@@ -52,10 +52,7 @@ class SharedPaths(eqx.Module):
         """The maps of paths, numbered from 0, each at a time of its own."""
         xp = np if isinstance(self.matrices, np.ndarray) and isinstance(t, np.ndarray) else jnp
         matrices, times = xp.asarray(self.matrices), xp.asarray(self.times)
-        if xp is np:  # without the times of every Gaussian's path, of which there may be thousands
-            before, after, fraction = locate_in_rows(times, path, t)
-        else:
-            before, after, fraction = locate(times[path], t)
+        before, after, fraction = locate(times, path, t)
         fraction = fraction[..., None, None]
         return (1 - fraction) * matrices[path, before] + fraction * matrices[path, after]
 
