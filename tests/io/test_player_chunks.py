@@ -162,6 +162,7 @@ def write_linked(folder, path):
         return write_html(folder / "page.html", path, linked=True).name
 
 
+@pytest.mark.slow
 def test_a_file_from_the_disk_comes_in_chunks(opened, film, whole, tmp_path):
     bare = opened(None, fresh=True)
     drop(bare, save_compact(tmp_path / "film.fgz", film))

@@ -97,6 +97,7 @@ def test_a_model_that_no_file_holds_is_told(opened, compact):
         page.press("Escape")
 
 
+@pytest.mark.slow
 def test_what_no_image_has_is_left_out_of_the_model(opened, tmp_path):
     """Gaussians of the middle of the clip, moved behind its end."""
     model = soft_model(options=RenderOptions())
@@ -113,6 +114,7 @@ def test_what_no_image_has_is_left_out_of_the_model(opened, tmp_path):
     assert_shows(page, model)
 
 
+@pytest.mark.slow
 def test_messages_stand_above_the_dialog(opened, compact):
     page = opened(compact)
     for name in ("files", "help"):

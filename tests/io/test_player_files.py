@@ -75,7 +75,9 @@ def test_a_vegas_file_without_a_size_is_asked_for_it(opened, tmp_path):
     assert bare.page.locator("#whole").inner_text() == "/ 0:00.50"
 
 
-@pytest.mark.parametrize("how", [{}, {"axes": "y-up", "depth_step": 2e-3, "sh_degree": 0}])
+@pytest.mark.parametrize(
+    "how", [{}, pytest.param({"axes": "y-up", "depth_step": 2e-3, "sh_degree": 0}, marks=pytest.mark.slow)]
+)
 def test_a_3dgs_frame_looks_like_the_frame_it_was_exported_from(opened, tmp_path, how):
     bare, model = opened(None, fresh=True), soft_model(options=RenderOptions(low_pass=0.5))
     drop(bare, write_3dgs_ply(tmp_path / "frame.ply", model, 0.4, **how))

@@ -39,7 +39,7 @@ QUICK_OVER = (*QUICK, "huge", "opaque", "giant")
 COMBINATIONS = [
     pytest.param(*case, kind, marks=[] if case == ("cpu", "over", "default") or kind in quick else [pytest.mark.slow])
     for case in CASES
-    for quick in [QUICK_OVER if case[1:] == ("over", "default") else QUICK]
+    for quick in [QUICK_OVER if case[1:] == ("over", "default") else QUICK if case[0] == "cpu" else ()]
     for kind in KINDS
 ]
 
@@ -95,7 +95,7 @@ def test_lists_end_where_all_pixels_are_finished():
     assert sum((stop - start[:-1]).sum() for start, _, stop, _ in trace.lists) * cpu.PIXELS < trace.num_pairs / 2
 
 
-@pytest.mark.parametrize("compositing", ["over", "sum"])
+@pytest.mark.parametrize("compositing", ["over", pytest.param("sum", marks=pytest.mark.slow)])
 def test_reference_gradient_by_finite_differences(compositing):
     with jax.enable_x64(True):
         splats, size = scene("plain", dtype=np.float64)
@@ -143,7 +143,7 @@ def test_jit_pinned_to_one_core():
     assert count == "4"
 
 
-@pytest.mark.parametrize("engine", ["cpu", "xla"])
+@pytest.mark.parametrize("engine", ["cpu", pytest.param("xla", marks=pytest.mark.slow)])
 def test_jit_and_vmap(engine):
     splats, size = scene("plain")
     draw = functools.partial(render, size=size, engine=engine, background=BACKGROUND)
@@ -157,7 +157,9 @@ def test_jit_and_vmap(engine):
     assert np.abs(np.asarray(stack)[1] - truth).max() > 1e-2
 
 
-@pytest.mark.parametrize("engine", [*OTHERS, pytest.param("pallas", marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    "engine", ["cpu", "xla", *(pytest.param(engine, marks=pytest.mark.slow) for engine in ("reference", "pallas"))]
+)
 @pytest.mark.parametrize("leaf", LEAVES)
 @pytest.mark.parametrize("value", [np.nan, np.inf])
 def test_splats_that_are_not_finite_are_left_out(engine, leaf, value):
@@ -287,9 +289,8 @@ def test_channels(engine, channels):
 @pytest.mark.parametrize(
     ("compositing", "engine"),
     [
-        *(("over", engine) for engine in OTHERS),
-        *(("sum", engine) for engine in ("cpu", "reference")),
-        pytest.param("sum", "xla", marks=pytest.mark.slow),
+        *((compositing, engine) for compositing in ("over", "sum") for engine in ("cpu", "reference")),
+        *(pytest.param(compositing, "xla", marks=pytest.mark.slow) for compositing in ("over", "sum")),
     ],
 )
 def test_exact_options_match_the_equation(engine, compositing):
@@ -392,7 +393,7 @@ def test_other_types_raise(call, message):
         call()
 
 
-@pytest.mark.parametrize("channels", [pytest.param(1, marks=pytest.mark.slow), 3, 5])
+@pytest.mark.parametrize("channels", [*(pytest.param(num, marks=pytest.mark.slow) for num in (1, 3)), 5])
 def test_callback_with_copies_renders_the_same(channels, monkeypatch):
     """As where the default device is no CPU."""
     splats, size = scene("plain")

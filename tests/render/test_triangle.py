@@ -253,10 +253,14 @@ def test_gradients_of_round_gaussians_are_those_of_a_fixed_angle():
     assert np.isfinite(second).all()
 
 
-@pytest.mark.usefixtures("optimized")
-def test_none_many_and_compiled_once():
+def test_none():
     none = from_scale_angle(*(jnp.asarray(np.asarray(leaf)[:0]) for leaf in parameters(3)), *rest(0))
     assert there_and_back(none).factor.shape == (0, 3, 3)
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("optimized")
+def test_many_and_compiled_once():
     gaussians = from_scale_angle(*parameters(), *rest())
     traces = []
 

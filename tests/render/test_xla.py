@@ -183,7 +183,7 @@ def test_gradient_by_finite_differences(compositing):
         check_slopes(loss, splats, LEAVES, rtol=1e-5)
 
 
-@pytest.mark.parametrize("dtype", [jnp.float16, jnp.bfloat16])
+@pytest.mark.parametrize("dtype", [jnp.float16, pytest.param(jnp.bfloat16, marks=pytest.mark.slow)])
 def test_half_precision_is_rendered_in_single(dtype):
     splats, size = scene("plain")
     half = jax.tree.map(lambda leaf: leaf.astype(dtype), splats)

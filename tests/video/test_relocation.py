@@ -118,7 +118,7 @@ def test_gaussians_alive_in_no_frame_move_first():
         ({"steps": 20}, 1),  # a pass takes 9 steps
         ({"strategy.sparse_updates": False}, 0),
         pytest.param({"views.two_cameras": True, "views.batch_size": 2}, 3, marks=pytest.mark.slow),
-        ({"views.interpolation_fraction": 0.5}, 3),
+        pytest.param({"views.interpolation_fraction": 0.5}, 3, marks=pytest.mark.slow),
         pytest.param({"compositing": "sum"}, 3, marks=pytest.mark.slow),
         ({"strategy.growth": Growth()}, 0),
         ({"rates": LearningRates(color_dc=1e5)}, 0),  # it diverges
@@ -143,7 +143,7 @@ def test_minutes_relocate_three_times_whatever_the_plan(monkeypatch):
     monkeypatch.setattr(Relocation, "apply", spy)
 
     def clock() -> float:
-        now[0] += 0.002 if 0.5 < now[0] < 2.0 else 0.006
+        now[0] += 0.006 if 0.5 < now[0] < 2.0 else 0.018
         return now[0]
 
     config = dataclasses.replace(CONFIG, steps=None, minutes=6 / 60)
@@ -154,6 +154,7 @@ def test_minutes_relocate_three_times_whatever_the_plan(monkeypatch):
     assert 0.1 < steps[0] / state.step < steps[1] / state.step < steps[2] / state.step < 0.7
 
 
+@pytest.mark.slow
 def test_relocation_finds_what_the_start_missed():
     """Colored rectangles flash in one frame: moved Gaussians improve it by 2 to 3 dB."""
     frames, rng = moving_blobs(), np.random.default_rng(0)

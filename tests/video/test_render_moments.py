@@ -33,7 +33,9 @@ VIDEOS = {
 }
 
 
-@pytest.mark.parametrize("name", VIDEOS)
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=pytest.mark.slow if "with a cut" in name else []) for name in VIDEOS]
+)
 def test_frames_are_those_of_their_learned_times(name):
     video = VIDEOS[name]()
     times, num = np.asarray(video.frame_times.times()), video.num_frames

@@ -36,7 +36,9 @@ FITS = {
     "on a device": (DEVICE_FRAMES, dataclasses.replace(ON_DEVICE, steps=40), (23,), 40),
     "growing on a device": (DEVICE_FRAMES, GROWING_ON_DEVICE, (23,), 34),
 }
-NAMES = [pytest.param(name, marks=[pytest.mark.slow] if name == "growing on a device" else []) for name in FITS]
+#: Each of these is another with less, or takes longer; the long runs take them.
+SLOW = ("frames alone", "the paper's, after a reset", "camera", "camera, on a device", "growing on a device")
+NAMES = [pytest.param(name, marks=[pytest.mark.slow] if name in SLOW else []) for name in FITS]
 
 
 @pytest.mark.parametrize("name", NAMES)

@@ -297,7 +297,7 @@ def progress_at(position, last, *, frame=None, frames=None, times=None, ease=0, 
     return s if curve == "linear" else s * s * (3 - 2 * s)
 
 
-@pytest.mark.parametrize("evenly", [True, False])
+@pytest.mark.parametrize("evenly", [True, pytest.param(False, marks=pytest.mark.slow)])
 @pytest.mark.parametrize(
     "when",
     [
