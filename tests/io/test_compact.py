@@ -301,7 +301,7 @@ def test_a_lower_quality_makes_a_smaller_file():
     assert sizes[-1] < 0.85 * sizes[0]
 
 
-@pytest.mark.parametrize("how", [pytest.param("opaque", marks=pytest.mark.slow), "alpha", "sum"])
+@pytest.mark.parametrize("how", ["opaque", "alpha", "sum"])
 def test_a_clip_makes_better_models(how):
     """A model that is not at its best is fitted further while its parameters are rounded."""
     best = soft_model(options=RenderOptions(), compositing="sum" if how == "sum" else "over")

@@ -187,6 +187,7 @@ def test_a_stream_without_times_is_read_on(tmp_path, counting):
     assert (counting.opened, counting.decoded) == (1, 102)
 
 
+@pytest.mark.slow
 def test_a_seek_that_lands_amid_blemishes_goes_further_back(tmp_path, counting):
     """Without frames that stand alone, a picture is whole only after a whole round of refreshing."""
     options = [*X264, "-x264-params", "intra-refresh=1:keyint=40", "-bf", "0"]

@@ -222,7 +222,7 @@ MODELS = {
 
 
 #: A setting each of conditioning, compositing and the clip; the long runs take the rest.
-QUICK = ("layers", "sum", "power 1, floor, no path", "cut")
+QUICK = ("sum", "power 1, floor, no path", "cut")
 
 
 @pytest.mark.parametrize("name", [pytest.param(k, marks=[] if k in QUICK else pytest.mark.slow) for k in MODELS])
@@ -386,6 +386,7 @@ def test_buttons_have_names_and_themes_change(opened):
     assert page.evaluate("document.documentElement.dataset.theme") == "dark"
 
 
+@pytest.mark.slow
 def test_a_lost_context_comes_back(opened):
     page = opened(soft_model(), fresh=True)
     before = page.picture(0.4)
@@ -396,6 +397,7 @@ def test_a_lost_context_comes_back(opened):
     np.testing.assert_array_equal(page.picture(), before)
 
 
+@pytest.mark.slow
 def test_without_webgl_the_page_says_so(browser, tmp_path):
     path = write_html(tmp_path / "page.html", soft_model())
     context = browser.new_context()

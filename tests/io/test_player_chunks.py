@@ -142,6 +142,7 @@ def test_chunks_of_the_time_shown_come_first(browser, film, whole, tmp_path):
     page.close()
 
 
+@pytest.mark.slow
 def test_without_ranges_the_file_is_read_as_it_comes(browser, film, tmp_path):
     """Two of its chunks are damaged or cut off."""
     path = damaged(save_compact(tmp_path / "film.fgz", film), 2)

@@ -60,6 +60,7 @@ def test_the_empty_page_opens_any_model(opened, compact, tmp_path):
     assert_shows(bare, parse_edit_script(IT + EDITS["rotate"]).apply(wanted))
 
 
+@pytest.mark.slow
 def test_a_vegas_file_without_a_size_is_asked_for_it(opened, tmp_path):
     bare = opened(None, fresh=True)
     model = soft_model(options=RenderOptions())
@@ -278,6 +279,7 @@ def test_a_video_is_recorded(opened, compact, tmp_path):
     assert page.stats["position"] == 5  # where the pictures were just taken
 
 
+@pytest.mark.slow
 def test_small_screens_and_both_themes_show_all(opened, compact):
     for width, height, scheme in ((1280, 800, "dark"), (360, 640, "light"), (740, 360, "dark")):
         page = opened(compact, viewport={"width": width, "height": height}, color_scheme=scheme)

@@ -60,7 +60,7 @@ def moving(tmp_path_factory):
 
 
 @pytest.mark.parametrize(
-    "name", ["strong", "sum, other times", *(pytest.param(name, marks=pytest.mark.slow) for name in ("over", "floor"))]
+    "name", [pytest.param(name, marks=[] if name == "sum, other times" else pytest.mark.slow) for name in CASES]
 )
 def test_pictures_are_those_of_the_engine(opened, tmp_path, name):
     model = make(**CASES[name])
@@ -149,6 +149,7 @@ def test_tools_take_what_is_seen_there(opened, moving):
     np.testing.assert_allclose(place["box"], [*own.min(0), *own.max(0)], atol=1e-5)
 
 
+@pytest.mark.slow
 def test_copies_beyond_what_can_be_held_are_refused(opened, moving, tmp_path):
     """A model file holds 255 paths; the page itself more."""
     page = opened(moving)

@@ -85,7 +85,9 @@ def stopped_after(job, step):
 
 
 @pytest.mark.parametrize(
-    "goal", [{}, {"quality": 60.0}, pytest.param({"size_mb": 0.006}, marks=pytest.mark.slow)], ids=str
+    "goal",
+    [{"quality": 60.0}, *(pytest.param(goal, marks=pytest.mark.slow) for goal in ({}, {"size_mb": 0.006}))],
+    ids=str,
 )
 def test_a_job_stopped_or_killed_at_any_write_goes_on_to_the_same_bits(clip, tmp_path, monkeypatch, goal):
     """The process ends as each file is about to be written; the next does what is left."""

@@ -347,6 +347,7 @@ def test_no_gaussians():
     assert flatten(scene).factor.shape == (0, 2, 2)
 
 
+@pytest.mark.slow
 def test_vmap_over_cameras():
     scene = flat_scene()
     angles = jnp.asarray([0.0, 0.4, math.pi])

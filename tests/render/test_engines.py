@@ -18,7 +18,7 @@ from foldgauss.render import Camera, Gaussians3D, RenderOptions, Splats2D, cpu, 
 
 #: Engine "pallas" takes no ceiling of 1 and, interpreted, long to compile: test_pallas.py. Here "auto" is "cpu".
 OTHERS = ["cpu", "xla", "reference"]
-SLOW_XLA = ["cpu", pytest.param("xla", marks=pytest.mark.slow), "reference"]
+CPU = ["cpu", *(pytest.param(engine, marks=pytest.mark.slow) for engine in ("xla", "reference"))]
 LEAVES = ("mean", "factor", "opacity", "color")
 BACKGROUND = jnp.asarray([0.2, 0.4, 0.6])
 OPTIONS = {"default": RenderOptions(), "sharp": RenderOptions(low_pass=0.01, transmittance_stop=0.0)}
@@ -313,7 +313,7 @@ def test_exact_options_match_the_equation(engine, compositing):
     np.testing.assert_allclose(picture, truth, atol=1e-6)  # 60 splats dropped at alpha 1e-8
 
 
-@pytest.mark.parametrize("engine", SLOW_XLA)
+@pytest.mark.parametrize("engine", CPU)
 def test_support_radius(engine):
     """Inside the radius nothing changes, outside nothing is drawn."""
     splats = Splats2D(jnp.asarray([[20.5, 20.5]]), 4 * jnp.eye(2)[None], jnp.asarray([0.9]), jnp.ones((1, 3)))
@@ -327,7 +327,7 @@ def test_support_radius(engine):
     assert float(whole[20, 30, 0]) > 1 / 255
 
 
-@pytest.mark.parametrize("engine", SLOW_XLA)
+@pytest.mark.parametrize("engine", CPU)
 def test_gradient_at_alpha_one(engine):
     """An opaque splat's center on a pixel's, no ceiling: what lies behind has no light, but alpha has its gradient."""
     with jax.enable_x64(True):
@@ -393,7 +393,7 @@ def test_other_types_raise(call, message):
         call()
 
 
-@pytest.mark.parametrize("channels", [*(pytest.param(num, marks=pytest.mark.slow) for num in (1, 3)), 5])
+@pytest.mark.parametrize("channels", [pytest.param(1, marks=pytest.mark.slow), 3, 5])
 def test_callback_with_copies_renders_the_same(channels, monkeypatch):
     """As where the default device is no CPU."""
     splats, size = scene("plain")

@@ -103,6 +103,7 @@ def test_unsupported_options_raise(options, name):
 
 
 @pytest.mark.parametrize("dtype", [np.float16, pytest.param(np.float64, marks=pytest.mark.slow)])
+@pytest.mark.slow
 def test_dtypes(dtype):
     """Inside it is float32."""
     with jax.enable_x64(True):

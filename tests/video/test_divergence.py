@@ -49,10 +49,9 @@ def _fit_with(change, config: FitConfig = CONFIG, at: int = 100) -> float:
     ("leaf", "value"),
     [
         ("loc", np.nan),
-        ("coefficients", -np.inf),
         *(
             pytest.param(*case, marks=pytest.mark.slow)
-            for case in (("opacity_logit", np.inf), ("log_time_scale", np.nan))
+            for case in (("coefficients", -np.inf), ("opacity_logit", np.inf), ("log_time_scale", np.nan))
         ),
     ],
 )

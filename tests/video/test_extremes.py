@@ -115,7 +115,7 @@ def check_whole(model, history, frames):
 
 #: Each of these has a neighbor that is farther at the extreme; the long runs take them.
 SLOW = ("two frames", "all white", "one black frame", "two pictures in turn", "8x8", "1x4096", "4096x1")
-SLOW += ("one frame with alpha",)
+SLOW += ("one frame with alpha", "two unlike frames", "all black", "one bright pixel")
 
 
 @pytest.mark.parametrize("name", [pytest.param(k, marks=pytest.mark.slow if k in SLOW else []) for k in CLIPS])

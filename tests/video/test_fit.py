@@ -180,6 +180,7 @@ def test_interpolated_frames_are_learned():
     assert abs(result.history[-1].psnr - evaluate(result.model, seen).mean_psnr) < 2
 
 
+@pytest.mark.slow
 def test_interpolation_ends():
     """After its last step, a fit goes on from where it is as one without interpolation would."""
     frames, models = moving_blobs(), []
@@ -474,6 +475,7 @@ def test_start_from_refuses_arguments_out_of_range(fitted):
             start_from(fitted[1], CONFIG, steps, progress)
 
 
+@pytest.mark.slow
 def test_gaussians_below_the_cutoff_of_scales_are_not_drawn():
     """In the fit as in the model that comes of it, which keeps the cutoff."""
     config, frames = CONFIG.replace(power=2.0, **{"strategy.scale_cutoff": 0.03}, steps=30), moving_blobs()

@@ -129,6 +129,7 @@ def test_where_nothing_moves_this_is_an_error(pan, noise):
         find_moving_object(noisy)
 
 
+@pytest.mark.slow
 def test_each_shot_has_its_own_object_or_none(caplog):
     one, _, truth = disc_clip(num_frames=5)
     other, _, other_truth = disc_clip(pan=0.0, speed=-2.0, seed=5, num_frames=5)

@@ -13,7 +13,7 @@ from foldgauss.video.fitting.steppers.jax_loss import custom_loss
 from foldgauss.video.fitting.steppers.loss import image_loss
 
 CLIP = datasets.waves().frames
-CONFIG = FitConfig(num_gaussians=30, steps=40, loss=Loss(ssim_fraction=0, l2_fraction=0), follow_camera=False)
+CONFIG = FitConfig(num_gaussians=30, steps=40, loss=Loss(ssim_fraction=0, l2_fraction=0))
 
 
 @pytest.fixture(autouse=True)
@@ -50,16 +50,11 @@ class DropEverySecond(DensityControl):
         state.keep(np.arange(0, state.num_gaussians, 2))
 
 
-def test_an_own_control_changes_the_gaussians_on_each_engine():
-    """Beside an own loss, whose values are the same."""
-    register_loss("l1", mean_error)
-    losses = {}
-    for engine in ("cpu", "xla"):
-        config = CONFIG.replace(engine=engine, steps=24, **{"loss.name": "l1", "views.interpolation_fraction": 0.0})
-        told = [info for _, info in fit_steps(CLIP, config, controls=[DropEverySecond()])]
-        assert [info.num_gaussians for info in told] == [30] * 19 + [15] * 5
-        losses[engine] = [info.loss for info in told]
-    np.testing.assert_allclose(losses["xla"][:9], losses["cpu"][:9], rtol=1e-3)
+@pytest.mark.parametrize("engine", ["cpu", pytest.param("xla", marks=pytest.mark.slow)])
+def test_an_own_control_changes_the_gaussians(engine):
+    config = dataclasses.replace(CONFIG, engine=engine)
+    counts = [info.num_gaussians for _, info in fit_steps(CLIP, config, controls=[DropEverySecond()])]
+    assert counts == [30] * 19 + [15] * 21
 
 
 def test_leaves_are_views_of_the_rows():

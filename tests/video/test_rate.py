@@ -27,7 +27,6 @@ from foldgauss.video.fitting.config import DEFAULT_QUALITY
 from foldgauss.video.fitting.loop import finish, start
 from foldgauss.video.fitting.rate import ACTIONS, HEADER_BYTES, RateControl, _bracket, count_bytes, count_past
 from foldgauss.video.fitting.state import FitState, to_model
-from foldgauss.video.fitting.steppers import jax_stepper
 from foldgauss.video.models.row_layout import COLOR, GROUPS, SHAPE, TRAJECTORY, columns, group_bits
 
 FRAMES = ball(8, size=(48, 64)).clip.frames
@@ -88,12 +87,10 @@ def states():
 
 @pytest.fixture(scope="module")
 def on_xla(fitted):
-    """Settings of the last part of a fit, with two numbers of Gaussians for one program; the states."""
+    """Settings of the last part of a fit, with two numbers of Gaussians, for each of which it compiles; the states."""
     config = CONFIG.replace(engine="xla", degree=fitted.degree, steps=20)
     config = config.replace(**{"strategy.relocated_fraction": 0.0, "views.interpolation_fraction": 0.0})
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(jax_stepper, "CAPACITY_STEPS", 1)
-        yield config, states_of(FRAMES, config, start_from(fitted, config, 8, 0.6))
+    return config, states_of(FRAMES, config, start_from(fitted, config, 8, 0.6))
 
 
 @functools.cache

@@ -120,7 +120,7 @@ def test_gaussians_alive_in_no_frame_move_first():
         pytest.param({"views.two_cameras": True, "views.batch_size": 2}, 3, marks=pytest.mark.slow),
         pytest.param({"views.interpolation_fraction": 0.5}, 3, marks=pytest.mark.slow),
         pytest.param({"compositing": "sum"}, 3, marks=pytest.mark.slow),
-        ({"strategy.growth": Growth()}, 0),
+        pytest.param({"strategy.growth": Growth()}, 0, marks=pytest.mark.slow),
         ({"rates": LearningRates(color_dc=1e5)}, 0),  # it diverges
     ],
 )
@@ -207,7 +207,7 @@ def test_views_by_error_are_of_both_cameras():
     assert max(counts[0], counts[2]) < 30
 
 
-@pytest.mark.parametrize("unknown", [0.0, np.inf, np.nan])
+@pytest.mark.parametrize("unknown", [0.0, np.nan, pytest.param(np.inf, marks=pytest.mark.slow)])
 def test_frames_without_an_error_count_as_average(unknown):
     config = FitConfig(num_gaussians=20, views=Views(error_fraction=0.9))
     views = all_views(config, np.array([unknown, 1.0, 3.0, unknown]), 2000)

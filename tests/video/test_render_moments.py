@@ -118,7 +118,7 @@ def test_frames_and_seconds_end_where_the_clip_does(name):
         video.render(seconds=num / 8 + 0.01)
 
 
-@pytest.mark.parametrize("moment", [{"frame": 2}, {"seconds": 0.3}])
+@pytest.mark.parametrize("moment", [pytest.param({"frame": 2}, marks=pytest.mark.slow), {"seconds": 0.3}])
 def test_learned_times_have_gradients(moment):
     def loss(logits):
         model = dataclasses.replace(learned_model(), frame_times=FrameTimes(logits))

@@ -27,7 +27,7 @@ FITS = {
     "frames alone": (BLOBS, PLAIN.replace(**{"views.interpolation_fraction": 0.0}), (25,), 60),
     "interpolated frames": (BLOBS, PLAIN.replace(**{"views.interpolation_fraction": 0.5}), (25,), 60),
     "beside relocations": (BLOBS, dataclasses.replace(PLAIN, steps=120), (23, 24, 42), 120),
-    "beside births and resets": (GROWING_FRAMES, GROWING, (7, 10, 23, 45), 60),
+    "beside births and resets": (GROWING_FRAMES, GROWING, (10, 45), 60),
     "the paper's, after a reset": (moving_blobs(4, 24, 40), PAPER, (215,), 300),
     "alpha": (alpha_clip(), dataclasses.replace(PLAIN, steps=30), (12,), 30),
     "camera": (SHAKEN, SHORT, (10,), 24),
