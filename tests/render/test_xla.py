@@ -105,6 +105,7 @@ def test_backward_is_linear_in_rounds(capacity, most, monkeypatch):
     check_same(*grads, 1e-5)
 
 
+@pytest.mark.slow
 def test_pixels_outside_the_image_count_as_finished(monkeypatch):
     """Tiles that reach beyond the picture are left once dark like others."""
     splats, size = scene("curtain")[0], (44, 43)
