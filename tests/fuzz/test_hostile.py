@@ -141,7 +141,12 @@ CLAIMS = {
 }
 
 
-@pytest.mark.parametrize("claim", CLAIMS)
+#: What is refused by the same check as another; the long runs take these.
+SLOW = ("model: frames", "model: degree", "compact: more chunks", "compact: frames", "compact: degree")
+SLOW += ("compact: knots", "compact: bits", "ply: rows between", "ply: rows between as text", "masks: pixels")
+
+
+@pytest.mark.parametrize("claim", [pytest.param(k, marks=pytest.mark.slow if k in SLOW else []) for k in CLAIMS])
 def test_what_a_header_claims_is_held_against_the_file(claim, tmp_path):
     name, build = CLAIMS[claim]
     target, path = TARGET[name], TARGET[name].path(tmp_path)
@@ -244,7 +249,9 @@ EVIL = [
 ]
 
 
-@pytest.mark.parametrize("evil", EVIL, ids=repr)
+@pytest.mark.parametrize(
+    "evil", [*EVIL[:3], *(pytest.param(evil, marks=pytest.mark.slow) for evil in EVIL[3:])], ids=repr
+)
 def test_a_page_shows_every_string_as_text(evil, tmp_path):
     """The name in a model's metadata, that of its file, a title given: whatever a stranger can choose."""
     kept = save_video_model(tmp_path / "m.safetensors", tiny_model(), metadata={"clip": evil})

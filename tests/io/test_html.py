@@ -222,7 +222,7 @@ MODELS = {
 
 
 #: A setting each of conditioning, compositing and the clip; the long runs take the rest.
-QUICK = ("moved", "layers", "sum", "power 1, floor, no path", "cut")
+QUICK = ("sum", "power 1, floor, no path", "cut")
 
 
 @pytest.mark.parametrize("name", [pytest.param(k, marks=[] if k in QUICK else pytest.mark.slow) for k in MODELS])
@@ -386,6 +386,7 @@ def test_buttons_have_names_and_themes_change(opened):
     assert page.evaluate("document.documentElement.dataset.theme") == "dark"
 
 
+@pytest.mark.slow
 def test_a_lost_context_comes_back(opened):
     page = opened(soft_model(), fresh=True)
     before = page.picture(0.4)
@@ -396,6 +397,7 @@ def test_a_lost_context_comes_back(opened):
     np.testing.assert_array_equal(page.picture(), before)
 
 
+@pytest.mark.slow
 def test_without_webgl_the_page_says_so(browser, tmp_path):
     path = write_html(tmp_path / "page.html", soft_model())
     context = browser.new_context()
@@ -487,6 +489,7 @@ def test_pictures_of_segments_are_those_of_the_engine(opened, compositing):
     assert np.abs(page.picture(5 / 18, (60, 100)).astype(float) - larger).mean() < 0.5
 
 
+@pytest.mark.slow
 def test_a_variable_frame_rate_is_kept(opened, tmp_path):
     """Frames are shown at the clip's own times, of a model and of one in segments; a model saved has them, too."""
     for name, video in (("model.safetensors", soft_model()), ("segments.safetensors", segmented())):
@@ -595,6 +598,7 @@ def test_play_waits_for_a_segment_that_is_not_decoded(opened):
     assert np.abs(page.picture().astype(float) - play.frame(5.5 / 18)).mean() < 0.5
 
 
+@pytest.mark.slow
 def test_a_segment_that_cannot_be_decoded_is_told(browser, tmp_path):
     path = write_html(tmp_path / "page.html", segmented())
     text = path.read_text(encoding="utf-8")
@@ -613,7 +617,14 @@ def test_a_segment_that_cannot_be_decoded_is_told(browser, tmp_path):
 
 
 @pytest.mark.skipif(shutil.which("node") is None, reason="needs node, which runs the brush's own conditioning")
-@pytest.mark.parametrize("how", [{}, {"degree": 0}, {"degree": 4, "power": 1.0, "floor": 0.1}, "paths"])
+@pytest.mark.parametrize(
+    "how",
+    [
+        *(pytest.param(how, marks=pytest.mark.slow) for how in ({}, {"degree": 0})),
+        {"degree": 4, "power": 1.0, "floor": 0.1},
+        "paths",
+    ],
+)
 def test_the_brush_conditions_as_the_distribution_does(tmp_path, how):
     """The fold equation stands once in Python; the brush has it again, and is held to that."""
     path = tmp_path / "m.fgz"

@@ -142,6 +142,7 @@ def test_chunks_of_the_time_shown_come_first(browser, film, whole, tmp_path):
     page.close()
 
 
+@pytest.mark.slow
 def test_without_ranges_the_file_is_read_as_it_comes(browser, film, tmp_path):
     """Two of its chunks are damaged or cut off."""
     path = damaged(save_compact(tmp_path / "film.fgz", film), 2)
@@ -162,6 +163,7 @@ def write_linked(folder, path):
         return write_html(folder / "page.html", path, linked=True).name
 
 
+@pytest.mark.slow
 def test_a_file_from_the_disk_comes_in_chunks(opened, film, whole, tmp_path):
     bare = opened(None, fresh=True)
     drop(bare, save_compact(tmp_path / "film.fgz", film))

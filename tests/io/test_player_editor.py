@@ -97,6 +97,7 @@ def test_a_model_that_no_file_holds_is_told(opened, compact):
         page.press("Escape")
 
 
+@pytest.mark.slow
 def test_what_no_image_has_is_left_out_of_the_model(opened, tmp_path):
     """Gaussians of the middle of the clip, moved behind its end."""
     model = soft_model(options=RenderOptions())
@@ -113,6 +114,7 @@ def test_what_no_image_has_is_left_out_of_the_model(opened, tmp_path):
     assert_shows(page, model)
 
 
+@pytest.mark.slow
 def test_messages_stand_above_the_dialog(opened, compact):
     page = opened(compact)
     for name in ("files", "help"):
@@ -170,6 +172,7 @@ def test_undo_and_redo_go_through_all_steps(opened, compact):
     assert (page.stats["undoable"], page.stats["redoable"]) == (steps, 0)
 
 
+@pytest.mark.slow
 def test_the_edit_is_there_again_when_the_page_is(opened, compact):
     page = opened(compact)
     begin_edit(read_script(page, IT + EDITS["move"]), [20, 21])
@@ -281,6 +284,7 @@ def test_what_the_browser_kept_is_discarded_if_it_cannot_be_applied(opened, comp
     assert page.page.evaluate("Object.keys(localStorage)") == []
 
 
+@pytest.mark.slow
 def test_an_edit_that_the_browser_cannot_keep_leaves_no_older_one(opened, compact):
     page = opened(compact)
     read_script(page, IT + EDITS["hue"])

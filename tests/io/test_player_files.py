@@ -60,6 +60,7 @@ def test_the_empty_page_opens_any_model(opened, compact, tmp_path):
     assert_shows(bare, parse_edit_script(IT + EDITS["rotate"]).apply(wanted))
 
 
+@pytest.mark.slow
 def test_a_vegas_file_without_a_size_is_asked_for_it(opened, tmp_path):
     bare = opened(None, fresh=True)
     model = soft_model(options=RenderOptions())
@@ -75,7 +76,9 @@ def test_a_vegas_file_without_a_size_is_asked_for_it(opened, tmp_path):
     assert bare.page.locator("#whole").inner_text() == "/ 0:00.50"
 
 
-@pytest.mark.parametrize("how", [{}, {"axes": "y-up", "depth_step": 2e-3, "sh_degree": 0}])
+@pytest.mark.parametrize(
+    "how", [{}, pytest.param({"axes": "y-up", "depth_step": 2e-3, "sh_degree": 0}, marks=pytest.mark.slow)]
+)
 def test_a_3dgs_frame_looks_like_the_frame_it_was_exported_from(opened, tmp_path, how):
     bare, model = opened(None, fresh=True), soft_model(options=RenderOptions(low_pass=0.5))
     drop(bare, write_3dgs_ply(tmp_path / "frame.ply", model, 0.4, **how))
@@ -276,6 +279,7 @@ def test_a_video_is_recorded(opened, compact, tmp_path):
     assert page.stats["position"] == 5  # where the pictures were just taken
 
 
+@pytest.mark.slow
 def test_small_screens_and_both_themes_show_all(opened, compact):
     for width, height, scheme in ((1280, 800, "dark"), (360, 640, "light"), (740, 360, "dark")):
         page = opened(compact, viewport={"width": width, "height": height}, color_scheme=scheme)

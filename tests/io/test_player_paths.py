@@ -37,7 +37,7 @@ PLACES = {name: EDITS[name] for name in EDITS if name not in ("hue", "gain", "co
 PLACES["several"] = "\n[[edits]]\n".join(
     EDITS[name] for name in ("later", "transform", "backwards", "copies", "rotate")
 )
-QUICK = ("transform", "freeze", "several")
+QUICK = ("transform", "several")
 #: Edits with which Gaussians stand still for a part of the clip, which no model file holds.
 HOLDING = {"later", "later and earlier", "backwards", "copies", "several"}
 
@@ -59,7 +59,9 @@ def moving(tmp_path_factory):
     return save_compact(tmp_path_factory.mktemp("moving") / "clip.fgz", quantize_finely(model))
 
 
-@pytest.mark.parametrize("name", CASES)
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=[] if name == "sum, other times" else pytest.mark.slow) for name in CASES]
+)
 def test_pictures_are_those_of_the_engine(opened, tmp_path, name):
     model = make(**CASES[name])
     path = save_compact(tmp_path / "m.fgz", quantize_finely(model))
@@ -72,6 +74,7 @@ def test_pictures_are_those_of_the_engine(opened, tmp_path, name):
     assert np.abs(page.picture(0.9).astype(float) - opened(without).picture(0.9)).mean() > 1
 
 
+@pytest.mark.slow
 def test_any_file_is_opened(opened, moving, tmp_path):
     bare = opened(None, fresh=True)
     for name in ("over", "floor"):
@@ -84,7 +87,9 @@ def test_any_file_is_opened(opened, moving, tmp_path):
     assert_shows(bare, load_video_model(moving))
 
 
-@pytest.mark.parametrize("what", ["number", "lengths", "not finite"])
+@pytest.mark.parametrize(
+    "what", ["lengths", *(pytest.param(what, marks=pytest.mark.slow) for what in ("number", "not finite"))]
+)
 def test_damaged_paths_are_told(opened, tmp_path, what):
     model, bare = make(), opened(None, fresh=True)
     if what == "number":
@@ -144,6 +149,7 @@ def test_tools_take_what_is_seen_there(opened, moving):
     np.testing.assert_allclose(place["box"], [*own.min(0), *own.max(0)], atol=1e-5)
 
 
+@pytest.mark.slow
 def test_copies_beyond_what_can_be_held_are_refused(opened, moving, tmp_path):
     """A model file holds 255 paths; the page itself more."""
     page = opened(moving)

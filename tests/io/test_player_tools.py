@@ -61,6 +61,7 @@ def test_outlines_select_and_combine_by_keys(opened, compact):
         assert picked(page) == expected
 
 
+@pytest.mark.slow
 def test_an_outline_is_drawn_while_it_grows(opened, compact):
     page = opened(compact).press("p")
     for corner in [(-0.2, -0.1), (0.1, -0.1), (0.1, 0.1)]:

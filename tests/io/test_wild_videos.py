@@ -20,6 +20,7 @@ from commands import write_tone
 from made_clips import (
     CLIPS,
     SHOWN,
+    SLOW,
     assert_read_as,
     avi,
     encode,
@@ -42,7 +43,7 @@ from foldgauss.io.media import clip as clip_module
 from foldgauss.io.media import decoder
 
 
-@pytest.mark.parametrize("name", CLIPS)
+@pytest.mark.parametrize("name", [pytest.param(k, marks=pytest.mark.slow if k in SLOW else []) for k in CLIPS])
 def test_a_clip_is_read_as_the_table_says_and_its_spans_are_those_of_the_whole(tmp_path, name):
     path = CLIPS[name].write(tmp_path)
     clip, index = read_video(path), index_video(path)
@@ -162,8 +163,11 @@ def video(tmp_path):
         yield opened
 
 
+#: A kind of container each; the long runs take the rest.
+QUICK = ("a.ts", "a.mp4", "a.mkv", "a.avi")
 DAMAGED = {"a.ts": "mpeg2video", "b.ts": "libx264", "a.mp4": "libx264", "a.mkv": "libx264", "a.avi": "mpeg4"}
 DAMAGED |= {"a.flv": "libx264", "a.mpg": "mpeg2video", "a.m2v": "mpeg2video", "b.flv": "flv"}
+NAMES_OF_DAMAGED = [pytest.param(name, marks=[] if name in QUICK else pytest.mark.slow) for name in DAMAGED]
 
 
 def _damaged(path, codec, first, last):
@@ -175,7 +179,7 @@ def _damaged(path, codec, first, last):
     path.write_bytes(data[:low] + np.random.default_rng(0).bytes(high - low) + data[high:])
 
 
-@pytest.mark.parametrize("name", DAMAGED)
+@pytest.mark.parametrize("name", NAMES_OF_DAMAGED)
 def test_damage_in_the_middle_is_noted(tmp_path, name):
     _damaged(tmp_path / name, DAMAGED[name], 0.4, 0.42)
     clip = read_video(tmp_path / name)
@@ -187,7 +191,7 @@ def test_damage_in_the_middle_is_noted(tmp_path, name):
     assert (index.num_frames, index.notes) == (clip.num_frames, clip.notes)
 
 
-@pytest.mark.parametrize("name", [name for name in DAMAGED if not name.endswith("mp4")])  # which ends with its index
+@pytest.mark.parametrize("name", [case for case in NAMES_OF_DAMAGED if case.values != ("a.mp4",)])  # its index is there
 def test_a_file_that_ends_in_random_bytes_is_noted(tmp_path, name):
     _damaged(tmp_path / name, DAMAGED[name], 0.7, 1.0)
     clip = read_video(tmp_path / name)
@@ -312,7 +316,11 @@ def _as_ycbcr(signal, bits, limited):
         ("yuv420p10le", 9, False, True),
         ("yuv420p12le", 9, True, True),
         ("yuv444p10le", 9, True, True),
-        *((f"gray{bits}le", 9, limited, True) for bits in (10, 12, 16) for limited in (True, False)),
+        ("gray10le", 9, True, True),
+        *(
+            pytest.param(f"gray{bits}le", 9, limited, True, marks=pytest.mark.slow)
+            for bits, limited in ((10, False), (12, True), (12, False), (16, True), (16, False))
+        ),
     ],
 )
 def test_hdr_is_tone_mapped(tmp_path, transfer, kind, primaries, limited, declared):
@@ -487,7 +495,9 @@ def test_a_tail_cut_off(tmp_path, kept):
     assert clip.notes == (() if clip.num_frames == 8 else lost)
 
 
-@pytest.mark.parametrize("broken", [(0, 1), (3, 4), (0, 3)], ids=str)
+@pytest.mark.parametrize(
+    "broken", [(0, 3), *(pytest.param(both, marks=pytest.mark.slow) for both in ((0, 1), (3, 4)))], ids=str
+)
 def test_broken_frames_are_left_out(tmp_path, broken):
     packets = [bytes(100) if k in broken else png(frame) for k, frame in enumerate(noise())]
     (tmp_path / "a.avi").write_bytes(avi(packets, 48, 64))

@@ -84,7 +84,11 @@ def stopped_after(job, step):
         fit_job(job, lambda progress: progress.step < step)
 
 
-@pytest.mark.parametrize("goal", [{}, {"quality": 60.0}, {"size_mb": 0.006}], ids=str)
+@pytest.mark.parametrize(
+    "goal",
+    [{"quality": 60.0}, *(pytest.param(goal, marks=pytest.mark.slow) for goal in ({}, {"size_mb": 0.006}))],
+    ids=str,
+)
 def test_a_job_stopped_or_killed_at_any_write_goes_on_to_the_same_bits(clip, tmp_path, monkeypatch, goal):
     """The process ends as each file is about to be written; the next does what is left."""
     monkeypatch.setattr(fitting, "REPORT_SECONDS", 0.0)

@@ -29,7 +29,7 @@ def draw_both(splats, size, engine, background=(0, 0, 0)):
 
 #: Engine "pallas", interpreted, compiles for seconds.
 CASES = [(engine, kind) for engine in ENGINES[1:] for kind in ("plain", "curtain", "none") if engine != "pallas"]
-CASES += [("pallas", "plain")]
+CASES += [pytest.param("pallas", "plain", marks=pytest.mark.slow)]
 
 
 def deep_splats(kind="plain", *, dtype=np.float32):

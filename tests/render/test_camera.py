@@ -98,7 +98,7 @@ def test_to_flat_inverts_from_flat(thickness):
 # --- the mirror ------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(("aspect", "size"), [(2.0, (96, 48)), (0.6, (50, 50))])
+@pytest.mark.parametrize(("aspect", "size"), [(2.0, (96, 48)), pytest.param(0.6, (50, 50), marks=pytest.mark.slow)])
 def test_mirror_in_double_precision(aspect, size):
     with jax.enable_x64(True):
         gaussians = flat_scene(aspect=aspect, dtype=np.float64)
@@ -347,6 +347,7 @@ def test_no_gaussians():
     assert flatten(scene).factor.shape == (0, 2, 2)
 
 
+@pytest.mark.slow
 def test_vmap_over_cameras():
     scene = flat_scene()
     angles = jnp.asarray([0.0, 0.4, math.pi])

@@ -26,7 +26,10 @@ def weights(splats, size, **how):
 
 @pytest.mark.parametrize(
     ("compositing", "engine"),
-    [("over", "cpu"), ("sum", "cpu"), *(pytest.param(how, "xla", marks=pytest.mark.slow) for how in ("over", "sum"))],
+    [
+        ("over", "cpu"),
+        *(pytest.param(*how, marks=pytest.mark.slow) for how in (("sum", "cpu"), ("over", "xla"), ("sum", "xla"))),
+    ],
 )
 def test_equals_the_dense_solution(compositing, engine):
     """Two frames, of two sizes, that share their colors; the matrix is made from pictures of single splats."""

@@ -18,7 +18,7 @@ from foldgauss.render import Camera, Gaussians3D, RenderOptions, Splats2D, cpu, 
 
 #: Engine "pallas" takes no ceiling of 1 and, interpreted, long to compile: test_pallas.py. Here "auto" is "cpu".
 OTHERS = ["cpu", "xla", "reference"]
-SLOW_XLA = ["cpu", pytest.param("xla", marks=pytest.mark.slow), "reference"]
+CPU = ["cpu", *(pytest.param(engine, marks=pytest.mark.slow) for engine in ("xla", "reference"))]
 LEAVES = ("mean", "factor", "opacity", "color")
 BACKGROUND = jnp.asarray([0.2, 0.4, 0.6])
 OPTIONS = {"default": RenderOptions(), "sharp": RenderOptions(low_pass=0.01, transmittance_stop=0.0)}
@@ -39,7 +39,7 @@ QUICK_OVER = (*QUICK, "huge", "opaque", "giant")
 COMBINATIONS = [
     pytest.param(*case, kind, marks=[] if case == ("cpu", "over", "default") or kind in quick else [pytest.mark.slow])
     for case in CASES
-    for quick in [QUICK_OVER if case[1:] == ("over", "default") else QUICK]
+    for quick in [QUICK_OVER if case[1:] == ("over", "default") else QUICK if case[0] == "cpu" else ()]
     for kind in KINDS
 ]
 
@@ -95,7 +95,7 @@ def test_lists_end_where_all_pixels_are_finished():
     assert sum((stop - start[:-1]).sum() for start, _, stop, _ in trace.lists) * cpu.PIXELS < trace.num_pairs / 2
 
 
-@pytest.mark.parametrize("compositing", ["over", "sum"])
+@pytest.mark.parametrize("compositing", ["over", pytest.param("sum", marks=pytest.mark.slow)])
 def test_reference_gradient_by_finite_differences(compositing):
     with jax.enable_x64(True):
         splats, size = scene("plain", dtype=np.float64)
@@ -143,7 +143,7 @@ def test_jit_pinned_to_one_core():
     assert count == "4"
 
 
-@pytest.mark.parametrize("engine", ["cpu", "xla"])
+@pytest.mark.parametrize("engine", ["cpu", pytest.param("xla", marks=pytest.mark.slow)])
 def test_jit_and_vmap(engine):
     splats, size = scene("plain")
     draw = functools.partial(render, size=size, engine=engine, background=BACKGROUND)
@@ -157,7 +157,9 @@ def test_jit_and_vmap(engine):
     assert np.abs(np.asarray(stack)[1] - truth).max() > 1e-2
 
 
-@pytest.mark.parametrize("engine", [*OTHERS, pytest.param("pallas", marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    "engine", ["cpu", "xla", *(pytest.param(engine, marks=pytest.mark.slow) for engine in ("reference", "pallas"))]
+)
 @pytest.mark.parametrize("leaf", LEAVES)
 @pytest.mark.parametrize("value", [np.nan, np.inf])
 def test_splats_that_are_not_finite_are_left_out(engine, leaf, value):
@@ -287,9 +289,8 @@ def test_channels(engine, channels):
 @pytest.mark.parametrize(
     ("compositing", "engine"),
     [
-        *(("over", engine) for engine in OTHERS),
-        *(("sum", engine) for engine in ("cpu", "reference")),
-        pytest.param("sum", "xla", marks=pytest.mark.slow),
+        *((compositing, engine) for compositing in ("over", "sum") for engine in ("cpu", "reference")),
+        *(pytest.param(compositing, "xla", marks=pytest.mark.slow) for compositing in ("over", "sum")),
     ],
 )
 def test_exact_options_match_the_equation(engine, compositing):
@@ -312,7 +313,7 @@ def test_exact_options_match_the_equation(engine, compositing):
     np.testing.assert_allclose(picture, truth, atol=1e-6)  # 60 splats dropped at alpha 1e-8
 
 
-@pytest.mark.parametrize("engine", SLOW_XLA)
+@pytest.mark.parametrize("engine", CPU)
 def test_support_radius(engine):
     """Inside the radius nothing changes, outside nothing is drawn."""
     splats = Splats2D(jnp.asarray([[20.5, 20.5]]), 4 * jnp.eye(2)[None], jnp.asarray([0.9]), jnp.ones((1, 3)))
@@ -326,7 +327,7 @@ def test_support_radius(engine):
     assert float(whole[20, 30, 0]) > 1 / 255
 
 
-@pytest.mark.parametrize("engine", SLOW_XLA)
+@pytest.mark.parametrize("engine", CPU)
 def test_gradient_at_alpha_one(engine):
     """An opaque splat's center on a pixel's, no ceiling: what lies behind has no light, but alpha has its gradient."""
     with jax.enable_x64(True):

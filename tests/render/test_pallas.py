@@ -77,7 +77,7 @@ def test_batches_of_scenes(engine):
         np.testing.assert_allclose(one, other, atol=1e-5 * max(1, np.abs(other).max()))
 
 
-@pytest.mark.parametrize("compositing", ["over", "sum"])
+@pytest.mark.parametrize("compositing", ["over", pytest.param("sum", marks=pytest.mark.slow)])
 def test_it_lowers_for_a_gpu(compositing):
     """Forward and backward become programs of a GPU, whole batches too, with no call of the host in between."""
     splats, size = scene("plain")
@@ -102,7 +102,8 @@ def test_unsupported_options_raise(options, name):
         render(splats, size, engine="pallas", options=RenderOptions(**options))
 
 
-@pytest.mark.parametrize("dtype", [np.float16, np.float64])
+@pytest.mark.parametrize("dtype", [np.float16, pytest.param(np.float64, marks=pytest.mark.slow)])
+@pytest.mark.slow
 def test_dtypes(dtype):
     """Inside it is float32."""
     with jax.enable_x64(True):

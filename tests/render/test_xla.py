@@ -71,6 +71,7 @@ def leaves_of(splats):
     return splats.mean, splats.factor, splats.opacity, splats.color, BACKGROUND
 
 
+@pytest.mark.slow
 def test_a_few_wide_splats_take_one_round_inside_jit():
     """Where sizes are not known there is room for splats that fill the picture, while they are few."""
     rng, size, plans = np.random.default_rng(0), (320, 640), []
@@ -104,6 +105,7 @@ def test_backward_is_linear_in_rounds(capacity, most, monkeypatch):
     check_same(*grads, 1e-5)
 
 
+@pytest.mark.slow
 def test_pixels_outside_the_image_count_as_finished(monkeypatch):
     """Tiles that reach beyond the picture are left once dark like others."""
     splats, size = scene("curtain")[0], (44, 43)
@@ -183,7 +185,8 @@ def test_gradient_by_finite_differences(compositing):
         check_slopes(loss, splats, LEAVES, rtol=1e-5)
 
 
-@pytest.mark.parametrize("dtype", [jnp.float16, jnp.bfloat16])
+@pytest.mark.parametrize("dtype", [jnp.float16, pytest.param(jnp.bfloat16, marks=pytest.mark.slow)])
+@pytest.mark.slow
 def test_half_precision_is_rendered_in_single(dtype):
     splats, size = scene("plain")
     half = jax.tree.map(lambda leaf: leaf.astype(dtype), splats)

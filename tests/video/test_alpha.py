@@ -11,7 +11,7 @@ from foldgauss.video.fitting.schedule import to_planes
 from foldgauss.video.models.background import check_background, composite, random_background
 from foldgauss.video.models.renderer import VideoRenderer
 
-CONFIG = FitConfig(num_gaussians=800, steps=250)
+CONFIG = FitConfig(num_gaussians=400, steps=250)
 WHITE, GREEN = (1.0, 1.0, 1.0), (0.0, 1.0, 0.0)
 
 

@@ -89,7 +89,10 @@ def test_component_of_weight_zero_is_not_rendered():
 # --- splats ---------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("parts", [{}, {"fold": ZeroFold(2)}, {"envelope": Constant()}])
+@pytest.mark.parametrize(
+    "parts",
+    [{}, *(pytest.param(own, marks=pytest.mark.slow) for own in ({"fold": ZeroFold(2)}, {"envelope": Constant()}))],
+)
 def test_splats_hold_the_mixture(parts):
     mixture = _mixture(**parts)
     splats = FoldedSplats.from_mixture(mixture, color=[0.9, 0.2, 0.0])

@@ -47,7 +47,13 @@ def _fit_with(change, config: FitConfig = CONFIG, at: int = 100) -> float:
 
 @pytest.mark.parametrize(
     ("leaf", "value"),
-    [("loc", np.nan), ("opacity_logit", np.inf), ("coefficients", -np.inf), ("log_time_scale", np.nan)],
+    [
+        ("loc", np.nan),
+        *(
+            pytest.param(*case, marks=pytest.mark.slow)
+            for case in (("coefficients", -np.inf), ("opacity_logit", np.inf), ("log_time_scale", np.nan))
+        ),
+    ],
 )
 def test_nonfinite_parameter_is_named_and_repaired(slowed, leaf, value):
     def spoil(state):
@@ -144,7 +150,11 @@ def _clips():
     }
 
 
-@pytest.mark.parametrize("name", list(_clips()))
+#: Of each kind one; the long runs take the rest, and 200 Gaussians.
+QUICK = ("black", "noise", "flash", "one frame of noise", "alpha")
+
+
+@pytest.mark.parametrize("name", [pytest.param(k, marks=[] if k in QUICK else pytest.mark.slow) for k in _clips()])
 @pytest.mark.parametrize("num", [3, pytest.param(200, marks=pytest.mark.slow)])
 def test_good_fits_raise_no_warning(name, num):
     with warnings.catch_warnings():
@@ -161,6 +171,7 @@ def test_guard_changes_no_bit(monkeypatch):
     assert_same(watched, alone)
 
 
+@pytest.mark.slow
 def test_opacity_resets_raise_no_warning():
     small = {"num_gaussians": 200, "max_gaussians": 400, "steps": 300, "degree": 2}
     config = FitConfig.preset("paper", initialization="static", **small)

@@ -84,7 +84,9 @@ def splines_around(t):
     return [spline_filter(channel) for channel in image]
 
 
-@pytest.mark.parametrize("kind", ["Gaussian", "floor", "short-lived", "paths"])
+@pytest.mark.parametrize(
+    "kind", ["Gaussian", "paths", *(pytest.param(kind, marks=pytest.mark.slow) for kind in ("floor", "short-lived"))]
+)
 @pytest.mark.parametrize("name", BAKED)
 def test_what_is_baked_is_what_the_overlay_draws(name, kind):
     model = {"floor": soft_model(power=1.0, floor=0.1), "paths": path_model()}.get(kind, MODEL)

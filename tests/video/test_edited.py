@@ -238,7 +238,11 @@ KEPT = {
 }
 
 
-@pytest.mark.parametrize("name", KEPT)
+#: Of each kind one; the long runs take the rest.
+QUICK = ("affine", "copies", "time", "space", "camera by matrices")
+
+
+@pytest.mark.parametrize("name", [pytest.param(k, marks=[] if k in QUICK else pytest.mark.slow) for k in KEPT])
 def test_round_trip_is_exact(tmp_path, name):
     path = tmp_path / "edited.safetensors"
     video = KEPT[name](edit(layers(soft_model(seed=1, options=RenderOptions()), MODEL)).select(OBJECT, layer=1)).video()

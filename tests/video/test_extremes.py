@@ -113,7 +113,12 @@ def check_whole(model, history, frames):
     return scores
 
 
-@pytest.mark.parametrize("name", CLIPS)
+#: Each of these has a neighbor that is farther at the extreme; the long runs take them.
+SLOW = ("two frames", "all white", "one black frame", "two pictures in turn", "8x8", "1x4096", "4096x1")
+SLOW += ("one frame with alpha", "two unlike frames", "all black", "one bright pixel")
+
+
+@pytest.mark.parametrize("name", [pytest.param(k, marks=pytest.mark.slow if k in SLOW else []) for k in CLIPS])
 def test_a_short_fit_and_its_file(tmp_path, name):
     frames, least = CLIPS[name]
     result = fit(frames, FitConfig(num_gaussians=400, steps=120))
@@ -124,22 +129,26 @@ def test_a_short_fit_and_its_file(tmp_path, name):
     assert evaluate(kept, frames) == scores
 
 
-#: Each setting at two extremes or more, each extreme with three settings or more.
+#: Each setting at two extremes or more, each extreme with three settings or more; quickly, each setting at the first.
+AT = {
+    "between, psnr": ("8x8", "one frame", "all white", "black and white", "1x4096"),
+    "two cameras, batches": ("one frame", "all white", "8x8"),
+    "standard": ("all white", "1x4096"),
+    "sum": ("black and white", "one frame"),
+    "degree 0": ("1x4096", "all white"),
+    "degree 7": ("one frame", "black and white"),
+    "at rest": ("8x8", "one frame"),
+    "draft": ("all black", "one frame", "black and white", "1x4096"),
+    "paper": ("one frame", "all black", "black and white", "1x4096"),
+}
+
+
 @pytest.mark.parametrize(
     ("name", "setting"),
     [
-        *[(name, "between, psnr") for name in ("one frame", "all white", "black and white", "8x8", "1x4096")],
-        *[(name, "two cameras, batches") for name in ("one frame", "all white", "8x8")],
-        *[(name, "standard") for name in ("all white", "1x4096")],
-        *[(name, "sum") for name in ("one frame", "black and white")],
-        *[(name, "degree 0") for name in ("all white", "1x4096")],
-        *[(name, "degree 7") for name in ("one frame", "black and white")],
-        *[(name, "at rest") for name in ("one frame", "8x8")],
-        *[
-            (name, how)
-            for name in ("one frame", "all black", "black and white", "1x4096")
-            for how in ("draft", "paper")
-        ],
+        pytest.param(name, how, marks=[] if name == names[0] else pytest.mark.slow)
+        for how, names in AT.items()
+        for name in names
     ],
 )
 def test_every_setting_at_the_extremes(name, setting):
@@ -206,6 +215,7 @@ def test_one_frame_in_a_compact_file(tmp_path, still, how):
 # -------------------------------------------------------------------------------------------- alternating
 
 
+@pytest.mark.slow
 def test_slide_show_has_no_gaps():
     """Most intervals are cuts: gaps there would be the usual interval, and what is shown within them nothing."""
     frames = alternating("AABAABAAB", np.maximum(pictures_of(2), 100))
@@ -268,9 +278,8 @@ def test_ssim_of_small_pictures(size):
     assert ssim(one.swapaxes(0, 1), other.swapaxes(0, 1)) == pytest.approx(ssim(one, other))
 
 
-@pytest.mark.parametrize(  # degree 1, the default, needs more steps here
-    ("degree", "steps"), [(3, 200), pytest.param(None, 600, marks=pytest.mark.slow)]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize(("degree", "steps"), [(3, 200), (None, 600)])  # degree 1, the default, needs more steps here
 def test_exact_frames_cost_the_others_no_bits(degree, steps):
     """Half of the frames are black: the others are about as good as alone, in files that are hardly larger."""
     blobs, scores = moving_blobs(3, *SIZE), []

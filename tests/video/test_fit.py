@@ -65,23 +65,28 @@ def test_learns_a_clip():
     [
         {"degree": 0},
         {"degree": 7},
-        {"views.batch_size": 3},
         {"views.batch_size": 9},  # more than the clip has frames
         {"power": 1.0},
         {"loss.ssim_fraction": 0.0},
         {"rates.frame_times": 0.0},
         {"num_gaussians": 1},
-        {"rates.final": 0.0},
         {"floor": 0.1},
         {"steps": None, "minutes": 0.005},
         {"initialization": "static"},
         {"rates.by_duration": False},
-        {"loss.l2_fraction": 1.0},
-        {"views.interpolation_fraction": 0.5},
-        pytest.param({"loss.l2_fraction": 0.0}, marks=pytest.mark.slow),
         {"views.interpolation_fraction": 0.9, "views.batch_size": 2, "views.two_cameras": True, "psnr": 60.0},
         {"quality": 50.0},
-        {"size_mb": 0.006},
+        *(
+            pytest.param(changes, marks=pytest.mark.slow)
+            for changes in (
+                {"views.batch_size": 3},
+                {"rates.final": 0.0},
+                {"loss.l2_fraction": 1.0},
+                {"loss.l2_fraction": 0.0},
+                {"views.interpolation_fraction": 0.5},
+                {"size_mb": 0.006},
+            )
+        ),
     ],
     ids=str,
 )
@@ -93,6 +98,7 @@ def test_every_setting_works(changes):
         assert evaluate(model, frames).mean_psnr > 18
 
 
+@pytest.mark.slow
 def test_borders_of_a_pan():
     """No Gaussian starts beyond the frame, so the outermost pixels are covered from one side, and come out too dark."""
     image = resize(coffee(), (200, 300), anti_aliasing=True)
@@ -155,6 +161,7 @@ def test_finished_state_yields_once():
     assert again[0][1].progress == 1
 
 
+@pytest.mark.slow
 def test_interpolated_frames_are_learned():
     """Frames never seen come out better than without, and what is told is the quality at frames alone."""
     finer = panning(11, (2.0, 1.0), height=48, width=64)
@@ -173,6 +180,7 @@ def test_interpolated_frames_are_learned():
     assert abs(result.history[-1].psnr - evaluate(result.model, seen).mean_psnr) < 2
 
 
+@pytest.mark.slow
 def test_interpolation_ends():
     """After its last step, a fit goes on from where it is as one without interpolation would."""
     frames, models = moving_blobs(), []
@@ -219,6 +227,7 @@ def test_seed_matters():
     assert not np.array_equal(one.splats.loc, other.splats.loc)
 
 
+@pytest.mark.slow
 def test_frame_times_are_learned():
     """Frames sampled unevenly in time: the learned times move towards the true ones."""
     frames = moving_blobs(num_frames=21)
@@ -253,7 +262,7 @@ def test_planned_steps(config, num_frames, steps):
     [
         ({"steps": 7, "minutes": 10.0}, "steps"),
         ({"steps": 10**6, "minutes": 0.005}, "minutes"),
-        ({"steps": 7, "psnr": 5.0}, "steps"),
+        pytest.param({"steps": 7, "psnr": 5.0}, "steps", marks=pytest.mark.slow),
         ({"steps": None, "minutes": 0.005, "quality": 50.0}, "minutes"),
     ],
     ids=str,
@@ -466,6 +475,7 @@ def test_start_from_refuses_arguments_out_of_range(fitted):
             start_from(fitted[1], CONFIG, steps, progress)
 
 
+@pytest.mark.slow
 def test_gaussians_below_the_cutoff_of_scales_are_not_drawn():
     """In the fit as in the model that comes of it, which keeps the cutoff."""
     config, frames = CONFIG.replace(power=2.0, **{"strategy.scale_cutoff": 0.03}, steps=30), moving_blobs()

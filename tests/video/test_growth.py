@@ -262,6 +262,7 @@ def test_births_and_resets_are_on_schedule():
 
 
 @pytest.mark.usefixtures("unscaled")
+@pytest.mark.slow
 @pytest.mark.parametrize("criterion", ["screen_gradient", "time_gradient"])
 def test_either_gradient_alone_densifies(criterion):
     off = {"screen_gradient": 1e9, "time_gradient": 1e9, "reset_every": 1000}

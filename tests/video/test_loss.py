@@ -37,6 +37,9 @@ def loss_in_jax(x, y, share):
     return (1 - share) * jnp.mean(jnp.abs(x - y)) + share * (1 - jnp.mean(ssim))
 
 
+value_and_gradient = jax.jit(jax.value_and_grad(loss_in_jax))
+
+
 def test_map_agrees_with_scikit_image():
     x, y = (picture[0] for picture in pictures(97, 83))
     options = {"gaussian_weights": True, "sigma": SIGMA, "use_sample_covariance": False, "data_range": 1}
@@ -51,7 +54,7 @@ def test_value_and_gradient_agree_with_jax(height, width, share):
     x, y = pictures(height, width)
     with jax.enable_x64(True):
         wide = jnp.asarray(x, jnp.float64), jnp.asarray(y, jnp.float64)
-        value, gradient = jax.value_and_grad(loss_in_jax)(*wide, share)
+        value, gradient = value_and_gradient(*wide, share)
         value, gradient = float(value), np.asarray(gradient)
     ours = image_loss(x, y, ssim_fraction=share)
     assert ours.value == pytest.approx(value, abs=2e-6)

@@ -76,6 +76,7 @@ def test_interpolation_beats_plain_warping_at_occlusions():
             assert error[30:70, left : left + 10].mean() < 0.7 * plain_error[30:70, left : left + 10].mean()
 
 
+@pytest.mark.slow
 def test_interpolation_follows_accelerated_motion():
     """Half way in time is not half way along the path. What is beyond a cut does not change it."""
     finer = np.stack([panning(2, (0.06 * k * k, 0.0))[1] for k in range(17)])

@@ -25,7 +25,7 @@ def mean_error(image, target):
     return jnp.abs(image - target).mean()
 
 
-@pytest.mark.parametrize("engine", ["cpu", "xla"])
+@pytest.mark.parametrize("engine", ["cpu", pytest.param("xla", marks=pytest.mark.slow)])
 def test_an_own_loss_is_minimized_as_the_built_in_one(engine):
     """L1 by its own code and as a function: the same gradients, so the same fit to rounding."""
     register_loss("l1", mean_error)
@@ -50,7 +50,7 @@ class DropEverySecond(DensityControl):
         state.keep(np.arange(0, state.num_gaussians, 2))
 
 
-@pytest.mark.parametrize("engine", ["cpu", "xla"])
+@pytest.mark.parametrize("engine", ["cpu", pytest.param("xla", marks=pytest.mark.slow)])
 def test_an_own_control_changes_the_gaussians(engine):
     config = dataclasses.replace(CONFIG, engine=engine)
     counts = [info.num_gaussians for _, info in fit_steps(CLIP, config, controls=[DropEverySecond()])]

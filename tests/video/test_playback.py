@@ -23,8 +23,8 @@ def _model(power=2.0, floor=0.0, size=(37, 50)) -> VideoModel:
 @pytest.mark.parametrize(
     ("size", "power", "floor"),
     [
-        (None, 1.0, 0.0),
         ((60, 41), 2.0, 0.1),
+        pytest.param(None, 1.0, 0.0, marks=pytest.mark.slow),
         pytest.param(None, 2.0, 0.1, marks=pytest.mark.slow),
         pytest.param((60, 41), 1.0, 0.0, marks=pytest.mark.slow),
         *(

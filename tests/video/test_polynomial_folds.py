@@ -3,6 +3,7 @@
 import dataclasses
 import warnings
 
+import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -51,9 +52,9 @@ def test_the_error_is_what_is_left_at_the_frames_and_higher_degrees_reduce_it():
     # The error is that of the places, weighted by the envelope.
     fixed, stated = without_paths(model, 4)
     squares, total = np.zeros(NUM), np.zeros(NUM)
+    at, gaussians = eqx.filter_jit(lambda splats, t: splats.at(t)), fixed.splats.gaussians()
     for t in np.asarray(model.frame_times.times()):
-        one, other = model.splats.at(jnp.asarray(t)), fixed.splats.at(jnp.asarray(t))
-        gaussians = fixed.splats.gaussians()
+        one, other = at(model.splats, jnp.asarray(t)), at(fixed.splats, jnp.asarray(t))
         tau = (t - np.asarray(gaussians.time_loc)) / np.asarray(gaussians.time_scale)
         weight = np.exp(-(tau**2)) * (np.asarray(one.opacity) > 0)
         squares += weight * ((np.asarray(one.mean) - np.asarray(other.mean)) ** 2).sum(-1)

@@ -1,6 +1,7 @@
 """Compact fits: what is rounded stays, goals are kept, resumed fits are the same, and nothing crashes at the edges."""
 
 import dataclasses
+import functools
 import itertools
 import math
 
@@ -85,6 +86,19 @@ def states():
 
 
 @pytest.fixture(scope="module")
+def on_xla(fitted):
+    """Settings of the last part of a fit, with two numbers of Gaussians, for each of which it compiles; the states."""
+    config = CONFIG.replace(engine="xla", degree=fitted.degree, steps=20)
+    config = config.replace(**{"strategy.relocated_fraction": 0.0, "views.interpolation_fraction": 0.0})
+    return config, states_of(FRAMES, config, start_from(fitted, config, 8, 0.6))
+
+
+@functools.cache
+def by_size(size_mb):
+    return fit(FRAMES, dataclasses.replace(CONFIG, quality=None, size_mb=size_mb))
+
+
+@pytest.fixture(scope="module")
 def by_quality():
     return {quality: fit(FRAMES, dataclasses.replace(CONFIG, quality=quality)) for quality in (30, 60, 100)}
 
@@ -137,13 +151,12 @@ def test_the_last_rounding_changes_only_what_was_not_rounded(states):
 
 
 @pytest.mark.parametrize("engine", ["cpu", "xla"])
-def test_rounded_parameters_do_not_move_and_others_do(fitted, engine):
-    """On "xla" in the last part of a fit, with two numbers of Gaussians: it compiles for each."""
-    config, state = CONFIG.replace(engine=engine, **{"strategy.relocated_fraction": 0.0}), None
+def test_rounded_parameters_do_not_move_and_others_do(request, engine):
     if engine == "xla":
-        config = dataclasses.replace(config, degree=fitted.degree, steps=20)
-        state = start_from(fitted, config, 8, 0.6)
-    kept = states_of(FRAMES, config, state)
+        config, kept = request.getfixturevalue("on_xla")
+    else:
+        config = CONFIG.replace(**{"strategy.relocated_fraction": 0.0})
+        kept = states_of(FRAMES, config)
     bits = group_bits(config.fold_degree)
     first = next(step for step, state in kept.items() if state.rules)
     assert first / config.steps == next(action.progress for action in ACTIONS if action.what == SHAPE)
@@ -209,9 +222,9 @@ def test_higher_quality_is_a_better_and_larger_model(by_quality):
     assert sizes[-1] > 2 * sizes[0]
 
 
-@pytest.mark.parametrize("size_mb", [0.0046, 0.006, 0.008, 0.02])
+@pytest.mark.parametrize("size_mb", [0.0045, 0.006, *(pytest.param(s, marks=pytest.mark.slow) for s in (0.008, 0.02))])
 def test_the_size_is_never_exceeded(tmp_path, size_mb):
-    made = fit(FRAMES, dataclasses.replace(CONFIG, quality=None, size_mb=size_mb))
+    made = by_size(size_mb)
     path = save(made.quantized, tmp_path, ABOUT)
     assert path.stat().st_size <= 1e6 * size_mb
     same(load_video_model(path), made.model)
@@ -231,7 +244,7 @@ def test_the_last_number_is_found_to_half_a_percent_of_all():
 
 def test_a_larger_size_is_used_for_a_better_model():
     sizes = 0.0045, 0.006
-    made = [fit(FRAMES, dataclasses.replace(CONFIG, quality=None, size_mb=size)) for size in sizes]
+    made = [by_size(size) for size in sizes]
     scores = [evaluate(one.model, FRAMES).mean_psnr for one in made]
     assert scores[0] < scores[1]
     for one, size in zip(made, sizes, strict=True):
@@ -255,7 +268,9 @@ def over_white(model, frames):
     return evaluate(model, frames, background=(1.0, 1.0, 1.0)).mean_psnr
 
 
-@pytest.mark.parametrize("clip", ["usual", "half of it black", "low contrast"])
+@pytest.mark.parametrize(
+    "clip", ["usual", *(pytest.param(clip, marks=pytest.mark.slow) for clip in ("half of it black", "low contrast"))]
+)
 def test_a_psnr_within_reach_is_reached_by_a_file_that_is_hardly_larger_than_that_of_a_quality(clip):
     frames = texture(6) if clip == "low contrast" else FRAMES.copy()
     frames[: 4 if clip == "half of it black" else 0] = 0
@@ -267,6 +282,7 @@ def test_a_psnr_within_reach_is_reached_by_a_file_that_is_hardly_larger_than_tha
     assert count_bytes(made.quantized) < 1.1 * count_bytes(given.quantized)
 
 
+@pytest.mark.slow
 def test_a_psnr_is_that_over_any_background():
     frames = silhouette()
     config = FitConfig(steps=400, num_gaussians=150)
@@ -330,7 +346,7 @@ def test_gaussians_that_are_not_worth_their_bits_are_dropped_before_all_are_roun
 # ------------------------------------------------------------------------------------ resumed
 
 
-@pytest.mark.parametrize("step", [5, 30, 50, 65, 75, 90, 97, 99])
+@pytest.mark.parametrize("step", [30, 75, 97, *(pytest.param(k, marks=pytest.mark.slow) for k in (5, 50, 65, 90, 99))])
 def test_a_killed_and_resumed_fit_has_the_same_bits(states, tmp_path, step):
     """From a file of the state: before anything is dropped, and between roundings."""
     path, source = tmp_path / "m.checkpoint", {"digest": "x"}
@@ -345,7 +361,12 @@ def test_a_killed_and_resumed_fit_has_the_same_bits(states, tmp_path, step):
 
 @pytest.mark.parametrize(
     "goal",
-    [{"size_mb": 0.006}, {"psnr": 28.0}, {"quality": 60, "compositing": "sum"}, {"quality": 60, "engine": "xla"}],
+    [
+        {"size_mb": 0.006},
+        {"psnr": 28.0},
+        {"quality": 60, "compositing": "sum"},
+        pytest.param({"quality": 60, "engine": "xla"}, marks=pytest.mark.slow),
+    ],
     ids=str,
 )
 def test_other_goals_resume_likewise(tmp_path, goal):
@@ -358,13 +379,31 @@ def test_other_goals_resume_likewise(tmp_path, goal):
     same_states(again, state)
 
 
+def test_a_fit_on_a_device_resumes_likewise(on_xla, tmp_path):
+    """Between two roundings, and before Gaussians are dropped."""
+    config, kept = on_xla
+    path = save_checkpoint(tmp_path / "m.checkpoint", kept[16], config=config, source={})
+    for again, _ in fit_steps(FRAMES, config, load_checkpoint(path, config=config, source={})):
+        pass
+    assert kept[16].rounded.any()
+    same_states(again, kept[20])
+
+
 @pytest.fixture
 def many_chunks(monkeypatch):
     """Few Gaussians are already divided into chunks."""
     monkeypatch.setattr(chunks, "LEAST", 5)
 
 
-@pytest.mark.parametrize("goal", [{"quality": 80}, {"quality": 80, "compositing": "sum"}, {"size_mb": 0.012}], ids=str)
+@pytest.mark.parametrize(
+    "goal",
+    [
+        {"quality": 80},
+        pytest.param({"quality": 80, "compositing": "sum"}, marks=pytest.mark.slow),
+        {"size_mb": 0.012},
+    ],
+    ids=str,
+)
 def test_a_fit_in_chunks_is_its_file_and_resumes_to_the_same_bytes(tmp_path, many_chunks, goal):
     config = CONFIG.replace(**({"quality": None, "num_gaussians": 400, "steps": 60} | goal))
     path = tmp_path / "m.checkpoint"
@@ -398,36 +437,42 @@ GROWING = FitConfig.preset(
     quality=60,
 )
 #: All kinds of rounding and dropping are at fractions of the steps, so few steps have them, too.
-SHORT = dataclasses.replace(CONFIG, steps=30)
+SHORT = dataclasses.replace(CONFIG, num_gaussians=100, steps=30)
+SMALL = np.ascontiguousarray(FRAMES[:, ::2, ::2])
 EDGES = {
-    "alpha": (with_alpha(FRAMES), SHORT),
-    "sum": (FRAMES, dataclasses.replace(SHORT, compositing="sum")),
+    "alpha": (with_alpha(SMALL), SHORT),
+    "sum": (SMALL, dataclasses.replace(SHORT, compositing="sum")),
     "growth": (FRAMES, GROWING),
     "uniform growth": (FRAMES, FitConfig.preset("paper", num_gaussians=100, steps=60, quality=50)),
     "xla, growth": (FRAMES, dataclasses.replace(GROWING, engine="xla", steps=60)),
-    "one frame": (FRAMES[:1], SHORT),
-    "two frames": (FRAMES[:2], SHORT),
-    "one step": (FRAMES, dataclasses.replace(SHORT, steps=1)),
-    "two steps": (FRAMES, dataclasses.replace(SHORT, steps=2)),
-    "one Gaussian": (FRAMES, dataclasses.replace(SHORT, num_gaussians=1)),
-    "two Gaussians": (FRAMES, dataclasses.replace(SHORT, num_gaussians=2)),
-    "degree 0": (FRAMES, dataclasses.replace(SHORT, degree=0)),
-    "degree 7": (FRAMES, dataclasses.replace(SHORT, degree=7)),
-    "no paths": (FRAMES, dataclasses.replace(SHORT, follow_camera=False)),
-    "at rest": (FRAMES, dataclasses.replace(SHORT, initialization="static")),
-    "fixed times": (FRAMES, SHORT.replace(**{"rates.frame_times": 0.0, "strategy.sparse_updates": False})),
-    "minutes": (FRAMES, dataclasses.replace(SHORT, steps=None, minutes=0.01)),
-    "black": (np.zeros_like(FRAMES), SHORT),
+    "one frame": (SMALL[:1], SHORT),
+    "two frames": (SMALL[:2], SHORT),
+    "one step": (SMALL, dataclasses.replace(SHORT, steps=1)),
+    "two steps": (SMALL, dataclasses.replace(SHORT, steps=2)),
+    "one Gaussian": (SMALL, dataclasses.replace(SHORT, num_gaussians=1)),
+    "two Gaussians": (SMALL, dataclasses.replace(SHORT, num_gaussians=2)),
+    "degree 0": (SMALL, dataclasses.replace(SHORT, degree=0)),
+    "degree 7": (SMALL, dataclasses.replace(SHORT, degree=7)),
+    "no paths": (SMALL, dataclasses.replace(SHORT, follow_camera=False)),
+    "at rest": (SMALL, dataclasses.replace(SHORT, initialization="static")),
+    "fixed times": (SMALL, SHORT.replace(**{"rates.frame_times": 0.0, "strategy.sparse_updates": False})),
+    "minutes": (SMALL, dataclasses.replace(SHORT, steps=None, minutes=0.01)),
+    "black": (np.zeros_like(SMALL), SHORT),
     "clear": (np.zeros((4, 24, 32, 4), np.uint8), SHORT),
-    "quality 0": (FRAMES, dataclasses.replace(SHORT, quality=0)),
-    "tiny size": (FRAMES, dataclasses.replace(SHORT, quality=None, size_mb=0.0044)),
-    "out of reach": (FRAMES, dataclasses.replace(SHORT, quality=None, psnr=99.0)),
-    "any psnr": (FRAMES, dataclasses.replace(SHORT, quality=None, psnr=1.0)),
+    "quality 0": (SMALL, dataclasses.replace(SHORT, quality=0)),
+    "tiny size": (SMALL, dataclasses.replace(SHORT, quality=None, size_mb=0.0044)),
+    "out of reach": (SMALL, dataclasses.replace(SHORT, quality=None, psnr=99.0)),
+    "any psnr": (SMALL, dataclasses.replace(SHORT, quality=None, psnr=1.0)),
     "1x1": (moving_blobs(3, 1, 1), SHORT),
 }
 
 
-@pytest.mark.parametrize("name", EDGES)
+#: Each of these has a neighbor that is farther at the edge, or takes long; the long runs take them.
+SLOW = ("uniform growth", "xla, growth", "two frames", "two steps", "two Gaussians", "degree 7", "no paths", "at rest")
+SLOW += ("black", "any psnr")
+
+
+@pytest.mark.parametrize("name", [pytest.param(k, marks=pytest.mark.slow if k in SLOW else []) for k in EDGES])
 def test_every_kind_of_fit_gives_a_file(tmp_path, name):
     frames, config = EDGES[name]
     made = fit(frames, config)

@@ -33,7 +33,9 @@ VIDEOS = {
 }
 
 
-@pytest.mark.parametrize("name", VIDEOS)
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=pytest.mark.slow if "with a cut" in name else []) for name in VIDEOS]
+)
 def test_frames_are_those_of_their_learned_times(name):
     video = VIDEOS[name]()
     times, num = np.asarray(video.frame_times.times()), video.num_frames
@@ -116,7 +118,7 @@ def test_frames_and_seconds_end_where_the_clip_does(name):
         video.render(seconds=num / 8 + 0.01)
 
 
-@pytest.mark.parametrize("moment", [{"frame": 2}, {"seconds": 0.3}])
+@pytest.mark.parametrize("moment", [pytest.param({"frame": 2}, marks=pytest.mark.slow), {"seconds": 0.3}])
 def test_learned_times_have_gradients(moment):
     def loss(logits):
         model = dataclasses.replace(learned_model(), frame_times=FrameTimes(logits))

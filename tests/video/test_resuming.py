@@ -27,7 +27,7 @@ FITS = {
     "frames alone": (BLOBS, PLAIN.replace(**{"views.interpolation_fraction": 0.0}), (25,), 60),
     "interpolated frames": (BLOBS, PLAIN.replace(**{"views.interpolation_fraction": 0.5}), (25,), 60),
     "beside relocations": (BLOBS, dataclasses.replace(PLAIN, steps=120), (23, 24, 42), 120),
-    "beside births and resets": (GROWING_FRAMES, GROWING, (7, 10, 23, 45), 60),
+    "beside births and resets": (GROWING_FRAMES, GROWING, (10, 45), 60),
     "the paper's, after a reset": (moving_blobs(4, 24, 40), PAPER, (215,), 300),
     "alpha": (alpha_clip(), dataclasses.replace(PLAIN, steps=30), (12,), 30),
     "camera": (SHAKEN, SHORT, (10,), 24),
@@ -36,7 +36,9 @@ FITS = {
     "on a device": (DEVICE_FRAMES, dataclasses.replace(ON_DEVICE, steps=40), (23,), 40),
     "growing on a device": (DEVICE_FRAMES, GROWING_ON_DEVICE, (23,), 34),
 }
-NAMES = [pytest.param(name, marks=[pytest.mark.slow] if name == "growing on a device" else []) for name in FITS]
+#: Each of these is another with less, or takes longer; the long runs take them.
+SLOW = ("frames alone", "the paper's, after a reset", "camera", "camera, on a device", "growing on a device")
+NAMES = [pytest.param(name, marks=[pytest.mark.slow] if name in SLOW else []) for name in FITS]
 
 
 @pytest.mark.parametrize("name", NAMES)

@@ -156,7 +156,7 @@ def shares(selection):
     return of_disc, [mask[label == BOX].mean() for mask, label in zip(masks, labels, strict=True)]
 
 
-@pytest.mark.parametrize("k", [2, 14, 27])
+@pytest.mark.parametrize("k", [14, *(pytest.param(k, marks=pytest.mark.slow) for k in (2, 27))])
 def test_an_object_is_carried_both_ways(k):
     """From a segment to all others, by a box in the first one, too."""
     of_disc, of_box = shares(disc())
@@ -297,7 +297,7 @@ def progress_at(position, last, *, frame=None, frames=None, times=None, ease=0, 
     return s if curve == "linear" else s * s * (3 - 2 * s)
 
 
-@pytest.mark.parametrize("evenly", [True, False])
+@pytest.mark.parametrize("evenly", [True, pytest.param(False, marks=pytest.mark.slow)])
 @pytest.mark.parametrize(
     "when",
     [

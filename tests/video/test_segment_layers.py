@@ -72,7 +72,7 @@ def together(video, others, k, *, before=True):
     ("kind", "evenly"),
     [
         pytest.param("plain", False, marks=pytest.mark.slow),
-        ("short-lived", False),
+        pytest.param("short-lived", False, marks=pytest.mark.slow),
         pytest.param("one frame", False, marks=pytest.mark.slow),
         pytest.param("plain", True, marks=pytest.mark.slow),
         pytest.param("spans", False, marks=pytest.mark.slow),

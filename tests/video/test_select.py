@@ -246,13 +246,13 @@ def test_labels_do_not_propagate_across_a_cut():
 
 
 def test_masks_of_a_smaller_size_have_rounded_sides():
-    """480 of 1920 columns and 204 or 205 of 818 rows, as `select(moving=True)` renders images."""
-    large = dataclasses.replace(soft_model(), size=(818, 1920))
-    for rows in (204, 205):
-        assert len(by_mask(large, np.ones((rows, 480), bool), frame=0))
-    for rows in (203, 206):
+    """24 of 96 columns and 10 or 11 of 42 rows, as `select(moving=True)` renders images."""
+    large = dataclasses.replace(soft_model(), size=(42, 96))
+    for rows in (10, 11):
+        assert len(by_mask(large, np.ones((rows, 24), bool), frame=0))
+    for rows in (9, 12):
         with pytest.raises(ValueError, match="mask: expected the aspect"):
-            by_mask(large, np.ones((rows, 480), bool), frame=0)
+            by_mask(large, np.ones((rows, 24), bool), frame=0)
 
 
 # ------------------------------------------------------------------------------------- boxes, colors, times
@@ -415,6 +415,7 @@ def overlap(model, selection, masks):
     return np.mean(found)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", [DISC, BOX])
 def test_a_fitted_object_is_selected(fitted, name):
     model, labels = fitted

@@ -86,7 +86,9 @@ def test_cuts_and_images_with_alpha_are_left_alone(model):
         np.testing.assert_array_equal(shown, own)
 
 
-@pytest.mark.parametrize("order", ["backwards", "shuffled", "one by one"])
+@pytest.mark.parametrize(
+    "order", ["shuffled", *(pytest.param(order, marks=pytest.mark.slow) for order in ("backwards", "one by one"))]
+)
 def test_images_do_not_depend_on_their_order(model, order):
     times = interpolated_times(np.asarray(model.frame_times.times()), 3)
     images = list(interpolate_frames(model, times))

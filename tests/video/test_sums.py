@@ -12,7 +12,7 @@ from foldgauss.video.fitting.loop import start, to_model
 
 def test_sums_are_fitted_and_rendered_as_sums(tmp_path):
     frames = moving_blobs()
-    config = FitConfig(num_gaussians=800, steps=300, compositing="sum")
+    config = FitConfig(num_gaussians=400, steps=300, compositing="sum")
     model = fit(frames, config).model
     assert model.compositing == "sum"
     assert evaluate(model, frames).mean_psnr > 30
@@ -21,7 +21,7 @@ def test_sums_are_fitted_and_rendered_as_sums(tmp_path):
     np.testing.assert_allclose(
         np.clip(np.asarray(model.render(0.5)) * 255, 0, 255), next(iter(model.frames(np.array([0.5])))), atol=1.01
     )
-    order = np.random.default_rng(0).permutation(800)
+    order = np.random.default_rng(0).permutation(400)
     state = start(frames, config)
     shuffled = dataclasses.replace(state, rows=state.rows[order])
     one, other = (np.asarray(to_model(each, config, frames.shape[1:3], 25.0).render(0.3)) for each in (state, shuffled))
