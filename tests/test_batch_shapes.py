@@ -138,9 +138,8 @@ def test_batches_equal_single_elements(batch, num):
             np.testing.assert_allclose(ours[index], theirs, rtol=1e-4, atol=1e-5, err_msg=str(i))
 
 
-@pytest.mark.parametrize(
-    "function", [pytest.param(f, marks=[pytest.mark.slow] * (f is not _of_integrated)) for f in INTEGRATED]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("function", INTEGRATED)
 def test_shapes_of_integrals(function):
     shapes = [eqx.filter_eval_shape(function, _mixture(shape, 1), _points(shape)) for shape in ((), (4, 1))]
     for one, found in zip(*shapes, strict=True):
@@ -184,8 +183,8 @@ BY_QUADRATURE = {
     "TimeMixture given space",
     "Time given space",
 }
-#: A network and a path: test_mixture.py and test_fold.py; `condition` of time is `condition_time`.
-SAMPLED_ELSEWHERE = {"FoldedMixture, a network as fold", "FoldedMixture on a path", "Mixture by condition"}
+#: A network: test_mixture.py; `condition` of time is `condition_time`.
+SAMPLED_ELSEWHERE = {"FoldedMixture, a network as fold", "Mixture by condition"}
 PATH = {"times": [[0.0, 1.0]], "matrices": [[[[1.0, 0.0, 0.0], [0.0, 1.0, 0.0]], [[1.0, 0.0, 0.5], [0.0, 1.0, 0.0]]]]}
 
 

@@ -451,7 +451,8 @@ def test_times_too_coarse_for_float32_are_refused_or_counted_from_an_origin():
     far.sample(3), far.condition(-1, 1e6)  # in the precision of the fit
 
 
-@pytest.mark.parametrize("name", ["iris", pytest.param("wine", marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["iris", "wine"])
 def test_one_start_is_as_good_as_scikit_learns(name):
     from sklearn import datasets
 

@@ -73,7 +73,7 @@ def test_predictions_match_integrals_of_the_joint_density(time_column, options):
     X = X if time_column == 0 else X[:, ::-1]
     regressor = _regressor(**OPTIONS | options).fit(X, y)
     assert regressor.mixture_.time_column == (0 if time_column == 0 else 1)
-    grid = np.linspace(-6, 6, 401)
+    grid = np.linspace(-12, 12, 801)
     first, second = np.meshgrid(grid, grid, indexing="ij")
     for x in X[:2]:
         rows = np.column_stack([np.broadcast_to(x, (grid.size**2, 2)), first.ravel(), second.ravel()])

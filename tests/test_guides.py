@@ -33,6 +33,7 @@ SLOW = {
     "docs/formats.md",
     "docs/index.md",
     "docs/mixture.md",
+    "docs/quickstart.md",
     "docs/rendering.md",
     "docs/results.md",
     "docs/scale.md",

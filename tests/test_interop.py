@@ -97,7 +97,7 @@ EVERY = {
 
 
 #: Those tested in the quick suite; compiling takes the time.
-QUICK = {"batched", "normal"}
+QUICK = {"batched"}
 
 
 @pytest.fixture(params=[pytest.param(name, marks=() if name in QUICK else pytest.mark.slow) for name in EVERY])
