@@ -8,6 +8,7 @@ import sys
 import tempfile
 import threading
 from importlib.metadata import version
+from pathlib import Path
 
 # What is compiled is kept for the run, for all its processes: most modules compile the same small functions. It must be
 # set before JAX is imported; the workers of pytest-xdist inherit it.
@@ -69,6 +70,33 @@ def x64():
 def _clear_caches():
     jax.clear_caches()
     batch._compile_flat.cache_clear()
+
+
+#: The files that take longest. They are begun first, so that no process works on one of them when all others are done.
+LONGEST = (
+    "video/test_rate.py",
+    "test_distribution_conditional.py",
+    "test_guides.py",
+    "io/test_wild_videos.py",
+    "test_estimator.py",
+    "test_batch_shapes.py",
+    "render/test_engines.py",
+    "io/test_frame_index.py",
+    "video/test_follow_camera.py",
+    "video/test_resuming.py",
+    "test_tradeoff.py",
+    "test_distribution_moments.py",
+    "video/test_fit.py",
+    "video/test_extremes.py",
+    "test_reliability_threads.py",
+    "video/test_own_parts.py",
+    "io/test_player_chunks.py",
+)
+
+
+def pytest_collection_modifyitems(items):
+    place = {Path(__file__).parent / name: number for number, name in enumerate(LONGEST)}
+    items.sort(key=lambda item: place.get(item.path, len(LONGEST)))
 
 
 def pytest_unconfigure():

@@ -25,6 +25,7 @@ Commands run in this process, where kernels are compiled once, with the argument
 """
 
 import argparse
+import ast
 import dataclasses
 import functools
 import importlib
@@ -46,6 +47,7 @@ from markdown_it import MarkdownIt
 from PIL import Image
 
 from foldgauss import video
+from foldgauss.cli.app.application import load_commands
 from foldgauss.cli.fitting import demo
 from foldgauss.cli.viewing import view as viewing
 from foldgauss.io import Sound, datasets, save_video_model, write_frames, write_vegas_ply, write_video
@@ -104,6 +106,23 @@ def check_languages(page: str) -> None:
             assert not any(map(_COMMAND.match, block.text.splitlines())), f"{where}: a command; fence it as sh"
         else:
             assert block.language in RUN + READ, f"{where}: expected one of {RUN + READ}, got {block.language!r}"
+
+
+def check_names(page: str) -> None:
+    """What a page imports from the project exists, and the project's commands have the options that the page gives."""
+    for block in blocks(page):
+        if block.language == "python":
+            imports = (
+                node for node in ast.walk(ast.parse(block.text)) if isinstance(node, ast.Import | ast.ImportFrom)
+            )
+            own = [node for node in imports if ast.unparse(node).split()[1].startswith(PROJECT)]
+            exec(compile(ast.Module(own, []), str(ROOT / page), "exec"), {})
+        elif block.language == "sh":
+            for name, *words in (words[1:] for words in commands(block.text) if words[0] == PROJECT):
+                parameters = load_commands(name)[name].params
+                known = {option for one in parameters for option in (*one.opts, *one.secondary_opts)}
+                given = {word.partition("=")[0] for word in words if word.startswith("--")}
+                assert given <= known, f"{page}:{block.line}: foldgauss {name} has no {given - known}"
 
 
 def commands(text: str) -> Iterator[list[str]]:

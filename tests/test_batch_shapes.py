@@ -105,6 +105,8 @@ def _in_batch(m):
 
 
 EXACT = [_of_mixture, _of_mixture_at_times, _of_components]
+#: Each compiles for seconds; batches of other distributions: test_distribution.py and test_mixture.py.
+QUICK = [_of_mixture_at_times]
 INTEGRATED = [_of_integrated, _of_integrated_given_space, _of_time]
 
 
@@ -113,7 +115,9 @@ def _element(mixture, index):
 
 
 @pytest.mark.parametrize(("batch", "num"), CASES)
-@pytest.mark.parametrize("function", [*EXACT, *(pytest.param(f, marks=pytest.mark.slow) for f in INTEGRATED)])
+@pytest.mark.parametrize(
+    "function", [pytest.param(f, marks=[pytest.mark.slow] * (f not in QUICK)) for f in (*EXACT, *INTEGRATED)]
+)
 def test_batches_at_points_equal_single_elements(function, batch, num):
     mixture, x, each = _mixture(batch, num), _points(batch), eqx.filter_jit(function)
     found = each(mixture, x)
@@ -134,6 +138,7 @@ def test_batches_equal_single_elements(batch, num):
             np.testing.assert_allclose(ours[index], theirs, rtol=1e-4, atol=1e-5, err_msg=str(i))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("function", INTEGRATED)
 def test_shapes_of_integrals(function):
     shapes = [eqx.filter_eval_shape(function, _mixture(shape, 1), _points(shape)) for shape in ((), (4, 1))]
@@ -141,7 +146,7 @@ def test_shapes_of_integrals(function):
         assert found.shape == (2, 4, 1, *one.shape[1:])
 
 
-@pytest.mark.parametrize("function", [_of_mixture, _of_mixture_at_times])
+@pytest.mark.parametrize("function", [_of_mixture, pytest.param(_of_mixture_at_times, marks=pytest.mark.slow)])
 def test_a_mixture_of_one_component_is_the_component(function):
     """Compared with two equal components, of which one has no weight."""
     one, x = _mixture((), 1), _points(())
@@ -178,6 +183,8 @@ BY_QUADRATURE = {
     "TimeMixture given space",
     "Time given space",
 }
+#: A network: test_mixture.py; `condition` of time is `condition_time`.
+SAMPLED_ELSEWHERE = {"FoldedMixture, a network as fold", "Mixture by condition"}
 PATH = {"times": [[0.0, 1.0]], "matrices": [[[[1.0, 0.0, 0.0], [0.0, 1.0, 0.0]], [[1.0, 0.0, 0.5], [0.0, 1.0, 0.0]]]]}
 
 
@@ -199,7 +206,7 @@ def _check_samples(dist, x):
     assert (error < ALARM).all(), error.max()
 
 
-@pytest.mark.parametrize("kind", [*(k for k in SAMPLED if k not in BY_QUADRATURE)])
+@pytest.mark.parametrize("kind", [*(k for k in SAMPLED if k not in BY_QUADRATURE | SAMPLED_ELSEWHERE)])
 def test_samples_differ_and_have_the_mean(kind):
     dist = _to_sample(kind, (4, 1), 1)
     _check_samples(dist, jax.jit(lambda dist: dist.sample(jax.random.key(1), DRAWS))(dist))
@@ -213,7 +220,13 @@ def test_samples_of_several_components_and_by_quadrature(kind, batch, num):
     _check_samples(dist, dist.sample(jax.random.key(1), DRAWS))
 
 
-@pytest.mark.parametrize("kind", SAMPLED)
+#: Components of mixtures by quadrature, which are traced with these.
+OF_COMPONENTS = BY_QUADRATURE & {"TimeMixture given space", "Time given space"}
+
+
+@pytest.mark.parametrize(
+    "kind", [pytest.param(kind, marks=[pytest.mark.slow] * (kind in OF_COMPONENTS)) for kind in SAMPLED]
+)
 def test_shapes_of_samples(kind):
     dist = eqx.filter_eval_shape(_to_sample, kind, (4, 1), 1)
 

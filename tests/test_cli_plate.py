@@ -107,7 +107,7 @@ def test_the_plate_and_its_masks_are_written(model, tmp_path, monkeypatch):
     assert run("render", "--plate", model, "--save-masks", "masks", "--out", "empty", "--overwrite") == 0
 
 
-@pytest.mark.parametrize("form", ["folder", "image", "whole clip"])
+@pytest.mark.parametrize("form", ["folder", "image", pytest.param("whole clip", marks=pytest.mark.slow)])
 def test_own_masks_are_used_and_stay(model, tmp_path, monkeypatch, form):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(plate, "find_moving_object", None)  # nothing is searched for

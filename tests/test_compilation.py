@@ -59,6 +59,7 @@ print(Path("/proc/self/maps").read_text().count("\\n") - before)
 """
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not MAPS.exists(), reason="memory maps are read from /proc, which this system lacks")
 def test_a_program_of_an_integral_needs_few_memory_maps():
     """In a process of a user, without this suite's settings of XLA. By XLA's default this integral needs 200."""

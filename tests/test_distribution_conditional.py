@@ -20,8 +20,9 @@ from foldgauss.mixture import FoldedMixture
 
 CDF = eqx.filter_jit(lambda dist, x: dist.cdf(x))
 MEAN_AND_VARIANCE = eqx.filter_jit(lambda dist: (dist.mean, dist.variance))
-# An integral over time takes seconds to compile for each shape: what is given has this many points in most tests.
-MANY = 21
+# An integral over time takes seconds to compile for each shape: what is given has this many points in most tests, as
+# many as one of the sizes of `map_over_batch`, which evaluates no more of them then.
+MANY = 8
 
 
 pytestmark = pytest.mark.usefixtures("x64")
@@ -116,15 +117,16 @@ ENVELOPES = [(0.0, 0.0), (1.0, 0.0), (2.0, 0.0), (2.0, 0.01)]  # power and floor
 
 
 @pytest.mark.parametrize(
-    ("dim", "cases"), [(1, ENVELOPES[1::2]), *(pytest.param(dim, ENVELOPES, marks=pytest.mark.slow) for dim in (1, 2))]
+    ("dim", "cases", "num"),
+    [(1, ENVELOPES[1::2], MANY), *(pytest.param(dim, ENVELOPES, 21, marks=pytest.mark.slow) for dim in (1, 2))],
 )
-def test_time_given_space_integrates_to_one(dim, cases):
+def test_time_given_space_integrates_to_one(dim, cases, num):
     nodes, weights = np.polynomial.legendre.leggauss(20)
     for power, floor in cases:
         dist = folded(dim, power, floor)
         # At s = 1.5 and 1.95 the curve of one space coordinate passes at tau = 6.7 and 7.5, too, in widths of 1e-5;
         # just above -0.16, where it turns back, the density has a flat top.
-        s = jnp.concatenate([_points(dist, MANY - 3)[:, :-1], jnp.outer(jnp.array([1.5, 1.95, -0.15]), jnp.ones(dim))])
+        s = jnp.concatenate([_points(dist, num - 3)[:, :-1], jnp.outer(jnp.array([1.5, 1.95, -0.15]), jnp.ones(dim))])
         density = dist.time_given_space(s)
         assert isinstance(density, TimeMixture)
         assert (density.time.error_estimate < 1e-9).all()
@@ -132,7 +134,7 @@ def test_time_given_space_integrates_to_one(dim, cases):
         edges = np.stack([_edges(m[np.isfinite(m)]) for m in modes], axis=-1)
         half = 0.5 * np.diff(edges, axis=0)[:, None]
         t = edges[:-1, None] + half * (1 + nodes[:, None])
-        log_p = np.asarray(LOG_PROB(density, jnp.concatenate([t.reshape(-1, MANY), modes.T])[..., None]))
+        log_p = np.asarray(LOG_PROB(density, jnp.concatenate([t.reshape(-1, num), modes.T])[..., None]))
         for own, height in zip(modes, log_p[-modes.shape[1] :].T, strict=True):  # highest first, and apart
             assert (np.diff(height[height > -20]) < 0.01).all()
             assert (np.diff(np.sort(own[np.isfinite(own)])) > 1e-4).all()
@@ -338,7 +340,7 @@ def test_mass_on_a_curve_narrower_than_numbers_lie_apart(dtype):
     [
         (np.float64, 1e-17, 0.09),
         pytest.param(np.float32, 1e-9, 0.09, marks=pytest.mark.slow),
-        (np.float64, 0.3, 30.0),
+        pytest.param(np.float64, 0.3, 30.0, marks=pytest.mark.slow),
     ],
 )
 def test_time_where_space_tells_it_to_the_last_digit(dtype, scale, s):
@@ -364,7 +366,7 @@ def test_time_where_space_tells_it_to_the_last_digit(dtype, scale, s):
     places = np.array([-np.inf, 0.4 - root, 0.4 - root, 0.4 + root, 0.4 + root, np.inf])
     quantiles = density.icdf(jnp.asarray(np.tile(q, 8), dtype)[:, None])[..., 0]
     np.testing.assert_allclose(quantiles, np.tile(places, (MANY, 8)).T, **near)
-    draws = np.asarray(density.sample(jax.random.key(0), (48,)))
+    draws = np.asarray(density.sample(jax.random.key(0), (1008 // MANY,)))
     np.testing.assert_allclose(np.abs(draws - 0.4), root, rtol=20 * eps * (1 + 1 / root))
     # Binomial, 5 sd: p = 6e-7. Power: an atom of another share is off by sqrt(1000) times twice the difference.
     assert abs(np.mean(draws > 0.4) - 0.5) < 5 * 0.5 / np.sqrt(draws.size)
@@ -432,7 +434,8 @@ def _far_quantities(dist, s, tau):
     }
 
 
-def test_estimated_errors_near_a_ridge_are_no_smaller_than_the_errors():
+@pytest.mark.parametrize("num", [7, pytest.param(32, marks=pytest.mark.slow)])
+def test_estimated_errors_near_a_ridge_are_no_smaller_than_the_errors(num):
     """In float32, where s - c(tau) rounds: on the curve and next to it, for wide ridges and for narrow ones."""
     rng, scales = np.random.default_rng(0), np.array([1e-2, 1e-3, 1e-7])
     with jax.enable_x64(False):
@@ -444,7 +447,7 @@ def test_estimated_errors_near_a_ridge_are_no_smaller_than_the_errors():
             fold=PolynomialFold(np.float32([[0.8, -0.5], [0.6, 0.9]])),
             envelope=TimeLikelihood(),
         )
-        center = np.asarray(narrow.condition_time(np.float32(rng.normal(0.4, 0.6, size=(32, 3)))).loc)
+        center = np.asarray(narrow.condition_time(np.float32(rng.normal(0.4, 0.6, size=(num, 3)))).loc)
         away = 1 + np.float32([0, 6e-8, 2e-6])[:, None, None, None] * rng.normal(size=(3, *center.shape))
         s = np.float32(center * away)
         here = narrow.time_given_space(s).time  # the integrals of log_prob and of error_estimate are one

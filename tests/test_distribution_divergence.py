@@ -57,7 +57,7 @@ def test_divergence_from_itself_is_zero():
         ({"power": 2.0}, {"power": 0.5, "floor": 0.05, "time_loc": 0.5, "time_scale": 0.4, "bend": 1.1 * BEND}),
         pytest.param(({"floor": 0.2}, {"power": 0.5, "time_scale": 0.5, "loc": (0.0, 0.0)}), marks=pytest.mark.slow),
         ({"power": 0.0}, {"power": 0.2, "time_scale": 0.4, "tril": np.diag([0.4, 0.3])}),
-        ({"envelope": OwnLikelihood()}, {"power": 0.3, "time_scale": 0.4}),
+        pytest.param(({"envelope": OwnLikelihood()}, {"power": 0.3, "time_scale": 0.4}), marks=pytest.mark.slow),
     ],
 )
 def test_divergence_is_the_mean_of_the_log_ratio(pair):
@@ -163,7 +163,7 @@ POWERS = {
     "floor": ((1, 0.1), (1, 0.05)),
     "own": (None, (0.5, 0)),
 }
-QUICK_PAIRS = {("fourier", "polynomial", "constant"), ("spline", "callable", "power")}
+QUICK_PAIRS = {("spline", "callable", "power")}
 
 
 def _kl_by_quadrature(p, q, powers, scale, sign=1):
@@ -224,9 +224,8 @@ def test_eager_divergence_and_its_gradient():
     np.testing.assert_allclose(slope, (high - low) / 2e-5, rtol=1e-6)
 
 
-@pytest.mark.parametrize(
-    "floors", [*(pytest.param(floors, marks=pytest.mark.slow) for floors in ([0.0], [0.05])), [0.05, 0.0]]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("floors", [[0.0], [0.05], [0.05, 0.0]])
 def test_batches_in_float32_agree_with_a_loop_in_float64(floors):
     # Offsets 0 and 1e4, time scales 1e-12, 0.3 and 1e6, time_loc of q a half, 1e3 or 1e10 scales away.
     offset, scale = (x.ravel() for x in np.meshgrid([0.0, 1e4], [1e-12, 0.3, 1e6]))

@@ -52,7 +52,10 @@ def _model(covariance="full", floor=0.0, degree=DEGREE):
 
 
 densities = eqx.filter_jit(components.evaluate_densities)
+# The sums are the same for all kinds of covariances: they are compiled once.
 SUMS = eqx.filter_jit(accumulate)
+STEPPED = jax.jit(step_times)
+PROFILE = jax.jit(profile_log_likelihood, static_argnums=2)
 
 
 def log_density(params, envelope, x):
@@ -161,18 +164,12 @@ def test_newton_step_matches_finite_differences(x64, covariance):
         params = params._replace(tril=0.7 * jnp.broadcast_to(jnp.eye(2)[None], (K, 2, 2)))
     points, envelope = make_points(_data(), np.ones(N), K), ENVELOPES["1"]
 
-    @jax.jit
-    def propose():
-        here = accumulate(params, envelope, points, order=2)
-        return here, newton_step(here, model, DEGREE)
+    here = SUMS(params, envelope, points, order=2)
+    steps, promise = jax.jit(newton_step, static_argnums=2)(here, model, DEGREE)
 
-    here, (steps, promise) = propose()
-
-    @jax.jit
     def value(moved):
-        times = step_times(Times(params.time_loc, params.time_scale), moved)
-        there = accumulate(params, envelope, points, times=times)
-        return profile_log_likelihood(here, model, DEGREE, moved, there.gram[0], there.log_a[0])
+        there = SUMS(params, envelope, points, times=STEPPED(Times(params.time_loc, params.time_scale), moved))
+        return PROFILE(here, model, DEGREE, moved, there.gram[0], there.log_a[0])
 
     np.testing.assert_allclose((value(1e-5 * steps) - value(-1e-5 * steps)) / 2e-5, promise, rtol=1e-5)
     h = 1e-4

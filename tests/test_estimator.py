@@ -103,8 +103,7 @@ def test_linear_folds_match_scikit_learn(kind, degree, time):
 @pytest.mark.parametrize(
     ("kind", "degree"),
     [
-        *(pytest.param(*case, marks=pytest.mark.slow) for case in [("full", 1), ("spherical", 2)]),
-        ("diag", 0),
+        *(pytest.param(*case, marks=pytest.mark.slow) for case in [("full", 1), ("spherical", 2), ("diag", 0)]),
         ("tied", 2),
     ],
 )
@@ -207,6 +206,7 @@ def test_annealing_finds_the_best_optimum(start):
     assert min(_same_partition(fitted.predict(x), labels) for fitted in heated) > truth - 0.02
 
 
+@pytest.mark.slow
 def test_annealing_ends_at_temperature_one():
     """Plain EM from its end hardly moves."""
     x, _ = _tracks()
@@ -451,6 +451,7 @@ def test_times_too_coarse_for_float32_are_refused_or_counted_from_an_origin():
     far.sample(3), far.condition(-1, 1e6)  # in the precision of the fit
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["iris", "wine"])
 def test_one_start_is_as_good_as_scikit_learns(name):
     from sklearn import datasets
@@ -497,6 +498,7 @@ def test_columns_of_a_data_frame_are_named():
         named.condition("c", 0.5)
 
 
+@pytest.mark.slow
 def test_a_function_is_an_envelope():
     log_a = lambda t, time_loc, time_scale: -0.1 * jnp.abs((t - time_loc) / time_scale)  # noqa: E731
     assert np.isfinite(FoldedGaussianMixture(1, degree=1, envelope=log_a, max_iter=2).fit(_blobs()).lower_bound_)
@@ -700,6 +702,7 @@ def _demonstrations(seed, num):
     return np.concatenate(curves), np.repeat(np.arange(num), len(u))
 
 
+@pytest.mark.slow
 def test_groups_keep_components_from_collapsing_onto_one_curve():
     (x, groups), (held, _) = _demonstrations(0, 5), _demonstrations(1, 5)
     with pytest.warns(UserWarning, match="smooth curves.*groups") as told:

@@ -306,6 +306,7 @@ def test_distributions_on_paths(x64):
     np.testing.assert_allclose(kept.condition_time(0.3).loc, dist.condition_time(0.3).loc[:, 1:], rtol=1e-12)
 
 
+@pytest.mark.slow  # quick: test_batch_shapes.py
 def test_samples_on_paths_have_their_moments():
     dist = path_gaussians(dtype=np.float32, times=[[-0.5, 0.1, 0.6], [0.2, 0.5, 0.9]])
     x = np.asarray(jax.jit(lambda dist, key: dist.sample(key, (200_000,)))(dist, jax.random.key(0)), np.float64)
@@ -315,16 +316,21 @@ def test_samples_on_paths_have_their_moments():
         np.testing.assert_allclose(own, covariance, atol=0.02 * np.diag(own).max())
 
 
-def test_gradients_reach_paths(x64):
+@pytest.mark.parametrize("mixed", [False, pytest.param(True, marks=pytest.mark.slow)])
+def test_gradients_reach_paths(x64, mixed):
     dist, x = path_gaussians(), jnp.asarray(np.random.default_rng(8).uniform(0, 0.6, (6, 3)))
     leaves, static = eqx.partition(dist, eqx.is_inexact_array)
-    mixture_loss = lambda one: FoldedMixture(eqx.combine(one, static), weights=jnp.ones(5)).log_prob(x).sum()  # noqa: E731
-    plain_loss = lambda one: eqx.combine(one, static).log_prob(x[:, None]).sum()  # noqa: E731
+
+    def loss(one):
+        own = eqx.combine(one, static)
+        return (FoldedMixture(own, weights=jnp.ones(5)).log_prob(x) if mixed else own.log_prob(x[:, None])).sum()
+
     rng = np.random.default_rng(9)
-    way = jax.tree.map(lambda leaf: jnp.asarray(rng.normal(size=leaf.shape) * np.not_equal(leaf, 0)), leaves)
-    for loss in (mixture_loss, plain_loss):
-        slope = jax.jit(jax.grad(loss))(leaves)
-        along = sum(jnp.sum(a * b) for a, b in zip(jax.tree.leaves(slope), jax.tree.leaves(way), strict=True))
-        step = lambda h: jax.jit(loss)(jax.tree.map(lambda a, b: a + h * b, leaves, way))  # noqa: B023, E731
-        np.testing.assert_allclose((step(1e-6) - step(-1e-6)) / 2e-6, along, rtol=1e-5)
-        assert jnp.abs(slope.fold.matrices).max() > 0
+    leaves = jax.tree.map(np.asarray, leaves)
+    way = jax.tree.map(lambda leaf: rng.normal(size=leaf.shape) * (leaf != 0), leaves)
+    both = jax.jit(jax.value_and_grad(loss))
+    slope = jax.tree.map(np.asarray, both(leaves)[1])
+    along = sum(np.sum(a * b) for a, b in zip(jax.tree.leaves(slope), jax.tree.leaves(way), strict=True))
+    step = lambda h: both(jax.tree.map(lambda a, b: a + h * b, leaves, way))[0]  # noqa: E731
+    np.testing.assert_allclose((step(1e-6) - step(-1e-6)) / 2e-6, along, rtol=1e-5)
+    assert np.abs(slope.fold.matrices).max() > 0

@@ -21,14 +21,23 @@ NEEDS = {
     "docs/tutorial-points.md": ("sklearn",),
     "docs/uncertainty.md": ("emcee",),
 }
-#: Pages that take over 15 seconds; all others, new ones included, run by default.
+#: Pages that take long, of functions that have quick tests of their own: by default their names are checked.
+#: All others, new ones included, run.
 SLOW = {
     "README.md",
+    "docs/compress.md",
+    "docs/concepts.md",
     "docs/distribution.md",
+    "docs/editing.md",
     "docs/extending.md",
+    "docs/formats.md",
+    "docs/index.md",
     "docs/mixture.md",
+    "docs/quickstart.md",
+    "docs/rendering.md",
     "docs/results.md",
     "docs/scale.md",
+    "docs/tutorial-points.md",
     "docs/uncertainty.md",
 }
 
@@ -61,6 +70,11 @@ def test_page_runs(page, tmp_path, monkeypatch):
         assert eval(fact, names), fact
     if page == "docs/editing.md":
         check_edits(names, tmp_path)
+
+
+@pytest.mark.parametrize("page", sorted(SLOW))
+def test_names_of_a_page_that_does_not_run_by_default_exist(page):
+    guides.check_names(page)
 
 
 def test_every_check_has_its_page():
@@ -254,6 +268,20 @@ def test_what_is_wrong_fails(text, wrong, tmp_path, monkeypatch):
     (tmp_path / "page.md").write_text(text)
     with pytest.raises(wrong):
         guides.run_page(str(tmp_path / "page.md"), tmp_path, monkeypatch)
+
+
+@pytest.mark.parametrize(
+    ("text", "wrong"),
+    [
+        ("```python\nfrom foldgauss.video import nothing\n```", ImportError),
+        ("```sh\nfoldgauss info --nonsense\n```", AssertionError),
+        ("```sh\nfoldgauss nothing\n```", KeyError),
+    ],
+)
+def test_wrong_names_fail(text, wrong, tmp_path):
+    (tmp_path / "page.md").write_text(text)
+    with pytest.raises(wrong):
+        guides.check_names(str(tmp_path / "page.md"))
 
 
 def test_commands_are_split_as_a_shell_does():

@@ -111,6 +111,7 @@ def test_closed_form_is_generalised_least_squares(x64, covariance_type, time, en
     np.testing.assert_allclose(dist.time_scale, expected.time_scale, rtol=tolerance)
 
 
+@pytest.mark.slow
 def test_bic_has_its_least_value_at_the_true_degree():
     assert min((fit(_points(300), degree=degree) for degree in range(4)), key=lambda fit: fit.bic).degree == 2
 

@@ -28,6 +28,8 @@ from foldgauss.video.tradeoff import (
 
 SIZE, FRAMES = (24, 32), 6
 QUICK = ["--steps", "12"]
+#: Of the same number of frames: what is compiled for one serves all.
+SAME = ["--frames", "1:6", *QUICK]
 
 
 @pytest.fixture(scope="module")
@@ -51,7 +53,7 @@ def quickly_looked():
 def done(clip, tmp_path_factory):
     """All axes, to the end."""
     target = tmp_path_factory.mktemp("done") / "results"
-    assert run("tradeoff", clip, "--out", target, "--frames", "1:6", *QUICK) == 0
+    assert run("tradeoff", clip, "--out", target, *SAME) == 0
     return target
 
 
@@ -158,7 +160,7 @@ def test_everything_is_there(done, clip):
 
 
 def test_a_table_without_room_leaves_the_fits(clip, tmp_path, monkeypatch):
-    arguments = ["tradeoff", clip, "--out", tmp_path / "results", "--axes", "compositing", *QUICK]
+    arguments = ["tradeoff", clip, "--out", tmp_path / "results", "--axes", "compositing", *SAME]
     with full_disk(lambda path: path == tmp_path / "results" / "tradeoff.png"):
         call(*arguments, code=1, err="No space left")
     monkeypatch.delattr(runner, "fit_steps")
@@ -183,7 +185,7 @@ def test_stopped_by_hand(clip, tmp_path, monkeypatch):
         target,
         "--axes",
         "time",
-        *QUICK,
+        *SAME,
         code=1,
         err=["stopped by SIGINT; 1 of 4 points are done", "Give the same command again to continue."],
     )
@@ -191,21 +193,21 @@ def test_stopped_by_hand(clip, tmp_path, monkeypatch):
 
 
 def test_a_point_that_fails_is_left_out(clip, tmp_path, monkeypatch):
-    steps, arguments = runner.fit_steps, ["tradeoff", clip, "--out", tmp_path / "r", "--axes", "quality", *QUICK]
+    steps, arguments = runner.fit_steps, ["tradeoff", clip, "--out", tmp_path / "r", "--axes", "compositing", *SAME]
 
     def failing(frames, config, state):
-        if config.quality is not None:
+        if config.compositing == "sum":
             raise FitDiverged("the loss is NaN", None)
         return steps(frames, config, state)
 
     with monkeypatch.context() as broken:
         broken.setattr(runner, "fit_steps", failing)
-        call(*arguments, err="quality 30 is left out: FitDiverged: the loss is NaN")
+        call(*arguments, err="compositing sum is left out: FitDiverged: the loss is NaN")
     record = record_of(tmp_path / "r")
     assert [name_of(row) for row in record["points"]] == ["base"]
-    assert set(record["left_out"]) == {f"quality {quality}" for quality in (30, 50, 70, 90)}
+    assert set(record["left_out"]) == {"compositing sum"}
     assert run(*arguments) == 0  # tried again
-    assert len(record_of(tmp_path / "r")["points"]) == 5
+    assert len(record_of(tmp_path / "r")["points"]) == 2
     assert record_of(tmp_path / "r")["left_out"] == {}
 
 
@@ -226,9 +228,9 @@ def test_other_settings_are_refused(done, clip, tmp_path):
     before = {path: path.read_bytes() for path in done.rglob("*.*")}
     for options, told in (
         (["--frames", "1:6", "--steps", "13"], ["expected steps=12, got steps=13"]),
-        (["--frames", "1:6", *QUICK, "--seed", "1"], ["expected seed=0, got seed=1"]),
+        ([*SAME, "--seed", "1"], ["expected seed=0, got seed=1"]),
         (QUICK, ["num_frames=5", "num_frames=6"]),
-        (["--frames", "1:6", *QUICK, "--axes", "time"], ["axes=['time', 'gaussians'", "got axes=['time']"]),
+        ([*SAME, "--axes", "time"], ["axes=['time', 'gaussians'", "got axes=['time']"]),
     ):
         call("tradeoff", clip, "--out", done, *options, code=2, err=[*told, "--overwrite"])
     assert {path: path.read_bytes() for path in done.rglob("*.*")} == before
@@ -237,7 +239,7 @@ def test_other_settings_are_refused(done, clip, tmp_path):
     target.mkdir()
     (target / "tradeoff.json").write_text('{"points": [{"axis": "base"}], "settings": []}')
     call("tradeoff", clip, "--out", target, "--axes", "time", *QUICK, code=2, err="got something else")
-    assert run("tradeoff", clip, "--out", target, "--axes", "compositing", *QUICK, "--overwrite") == 0
+    assert run("tradeoff", clip, "--out", target, "--axes", "compositing", *SAME, "--overwrite") == 0
     assert len(record_of(target)["points"]) == 2
     (target / "mine.txt").write_text("mine")
     call(
@@ -276,7 +278,7 @@ def test_without_matplotlib_only_the_plot_is_missing(done, clip, monkeypatch, tm
         monkeypatch.setitem(sys.modules, name, None)
     target = tmp_path / "r"
     told = ["no plot", "foldgauss[plot]"]
-    call("tradeoff", clip, "--out", target, "--axes", "compositing", *QUICK, err=told)
+    call("tradeoff", clip, "--out", target, "--axes", "compositing", *SAME, err=told)
     assert sorted(path.name for path in target.iterdir()) == ["models", "tradeoff.json"]
 
 

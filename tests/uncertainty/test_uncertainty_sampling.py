@@ -65,7 +65,7 @@ def agrees(found, tolerance: float = 5.0) -> bool:
 
 @pytest.fixture(scope="module")
 def near():
-    return sampled(toy(*NEAR), ensembles=4)
+    return sampled(toy(*NEAR), steps=3000, ensembles=4)
 
 
 def test_few_frames_sample_the_known_posterior(near):
@@ -90,7 +90,7 @@ def test_wrong_prior_is_detected(monkeypatch):
     prior = log_prob.log_prior
     wrong = lambda times, concentration: prior(times, concentration + 1)  # noqa: E731
     monkeypatch.setattr(log_prob, "log_prior", wrong)
-    assert not agrees(sampled(toy(*NEAR)))
+    assert not agrees(sampled(toy(*NEAR), steps=2000))
 
 
 def test_draws_keep_their_order_and_their_ends(near):
@@ -100,7 +100,7 @@ def test_draws_keep_their_order_and_their_ends(near):
     assert near.draws.shape == (near.times[..., 0].size, 5)
 
 
-@pytest.mark.parametrize("concentration", [1.0, 3.0])
+@pytest.mark.parametrize("concentration", [pytest.param(1.0, marks=pytest.mark.slow), 3.0])
 def test_sweeps_sample_the_known_posterior(concentration):
     found = sampled(toy((0.2, 0.25, 0.4, 0.42, 0.75), (0.03, 0.04, 0.03, 0.05, 0.06)), concentration=concentration)
     assert found.converged
