@@ -29,7 +29,6 @@ def now():
     return json.loads(subprocess.run(command, env=environment, capture_output=True, text=True, check=True).stdout)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("name", RECORDED["digests"])
 def test_fit_has_the_recorded_bits(now, name):
     """Equal to the bit on the recorded kind of machine with the recorded versions; elsewhere, as good.

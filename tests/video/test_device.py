@@ -146,9 +146,9 @@ def test_so_many_images_are_prepared_and_they_are_dropped():
         assert prefetcher.prepare(step, 0.0, range(len(FRAMES)))
     assert not prefetcher.prepare(5, 0.0, [*range(len(FRAMES))] * 9)  # no more are kept
     prefetcher.drop(1)
-    assert prefetcher.num_prepared == sum(chosen) > 0
+    assert len(prefetcher.images) == sum(chosen) > 0
     prefetcher.drop(6)
-    assert prefetcher.num_prepared == 0
+    assert not prefetcher.images
 
 
 def test_a_fit_prepares_its_interpolated_frames(monkeypatch):

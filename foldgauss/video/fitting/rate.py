@@ -264,8 +264,8 @@ class RateControl(DensityControl):
         return min(self._count_passes(state.plan - state.step) / _PASSES, 1.0)
 
     def _count_passes(self, steps: int) -> float:
-        speedup = 1.0 if self.config.minutes is None else _SPEEDUP
-        return speedup * steps * self.config.views.batch_size / len(self.frames)
+        passes = steps * self.config.views.batch_size / len(self.frames)
+        return passes if self.config.minutes is None else _SPEEDUP * passes
 
     def _model(self, state: FitState, fps: float = 25.0) -> VideoModel:
         return to_model(state, self.config, self.frames.shape[1:3], fps)

@@ -64,33 +64,28 @@ class Prefetcher:
         """At most `most` images are kept, by default two for each thread: a process that ends waits for them."""
         self.interpolation, self._most = interpolation, 2 * num_threads() if most is None else most
         self._pool = ThreadPoolExecutor(num_threads(), thread_name_prefix="foldgauss-interpolation")
-        self._images: dict[tuple[int, int], Future] = {}  # by step and frame
-
-    @property
-    def num_prepared(self) -> int:
-        """Number of images that are kept, made or being made."""
-        return len(self._images)
+        self.images: dict[tuple[int, int], Future] = {}  # made or being made, by step and frame
 
     def prepare(self, step: int, progress: float, frames: Iterable[int]) -> bool:
         """Start to make the images that a step needs if these are its frames; False if no more are kept."""
         for k in frames:
             fraction = self.interpolation.choose(step, progress, k)
-            if fraction is not None and (step, k) not in self._images:
-                if len(self._images) >= self._most:
+            if fraction is not None and (step, k) not in self.images:
+                if len(self.images) >= self._most:
                     return False
                 future = self._pool.submit(self.interpolation.interpolate, k, fraction)
-                self._images[step, k] = future
+                self.images[step, k] = future
         return True
 
     def interpolate(self, step: int, k: int, fraction: float) -> np.ndarray:
         """`InterpolatedFrames.interpolate` of a frame of a step, which was prepared or is made now."""
-        future = self._images.get((step, k))
+        future = self.images.get((step, k))
         return self.interpolation.interpolate(k, fraction) if future is None else future.result()
 
     def drop(self, step: int) -> None:
         """Forget the images of this step and of those before it."""
-        for key in [key for key in self._images if key[0] <= step]:
-            self._images.pop(key).cancel()
+        for key in [key for key in self.images if key[0] <= step]:
+            self.images.pop(key).cancel()
 
 
 def make_interpolated(
