@@ -49,7 +49,7 @@ TARGETS = {
     "estimator/em/loop": ["test_em", "test_em_chunks", "test_estimator"],
     "estimator/em/m_step": ["test_em", "test_estimator"],
     "estimator/em/statistics": ["test_em", "test_em_chunks", "test_estimator"],
-    "render/_cpu_kernels": ["render/test_cpu", "render/test_weights", "render/test_engines"],
+    "render/_cpu_kernels": ["render/test_cpu", "render/test_engines"],
     "video/models/conditioning": ["video/test_conditioning"],
     "video/models/frame_times": ["video/test_frame_times"],
     "video/fitting/adam": ["video/test_adam"],

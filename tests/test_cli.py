@@ -237,7 +237,7 @@ def test_clip_with_alpha(tmp_path):
         alpha = np.zeros((48, 64, 1), np.uint8)
         alpha[8:40, 8:56] = 255
         cv2.imwrite(str(folder / f"{k}.png"), np.concatenate([frame[..., ::-1], alpha], -1))
-    arguments = ["--gaussians", "400", "--steps", "120", "--preview", tmp_path / "p.png"]
+    arguments = ["--gaussians", "400", "--steps", "120"]
     call("fit", folder, "--out", target, *arguments, out="48x64 with alpha")
     call("evaluate", target, folder, "--json", tmp_path / "f.json", out="PSNR over white")
     figures = json.loads((tmp_path / "f.json").read_text())

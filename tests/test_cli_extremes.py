@@ -48,7 +48,7 @@ def test_from_a_clip_to_its_pictures(tmp_path, monkeypatch, name):
     monkeypatch.chdir(tmp_path)
     frames = CLIPS[name]
     clip = written(tmp_path / "clip", frames)
-    assert run("fit", clip, "--out", "m.safetensors", *QUICK, "--preview", "p.png", "--history", "h.jsonl") == 0
+    assert run("fit", clip, "--out", "m.safetensors", *QUICK, "--history", "h.jsonl") == 0
     assert run("evaluate", "m.safetensors", clip, "--json", "s.json") == 0
     scores = json.loads((tmp_path / "s.json").read_text())
     assert 25 < scores["mean_psnr"] <= 100

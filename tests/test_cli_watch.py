@@ -1,4 +1,4 @@
-"""What a running fit shows and leaves behind, as a user meets it: history, curves, preview, lines, JSON, nothing."""
+"""What a running fit shows and leaves behind, as a user meets it: history, curves, lines, JSON, nothing."""
 
 import json
 import re
@@ -12,7 +12,7 @@ from commands import call, run
 
 from foldgauss.cli.fitting import fit as fitting
 from foldgauss.cli.shared import fit_progress as _progress
-from foldgauss.io import read_video, write_video
+from foldgauss.io import write_video
 from foldgauss.io.history import read_history
 from foldgauss.jobs import runner
 
@@ -71,26 +71,6 @@ def test_a_full_disk_ends_the_history_and_not_the_fit(clip, tmp_path, monkeypatc
     assert target.exists()
     assert len(read_history(tmp_path / "h.jsonl")) == 4
     assert told.count("No space left") == 1
-
-
-def test_preview_is_renewed_and_always_whole(clip, tmp_path, monkeypatch):
-    monkeypatch.setattr(_progress, "PREVIEW_SECONDS", 0.0)
-    path, seen, write = tmp_path / "look.png", [], _progress.write_image
-    monkeypatch.setattr(_progress, "write_image", lambda *a: seen.append(cv2.imread(str(write(*a)))))
-    assert run("fit", clip, "--out", tmp_path / "m.safetensors", *QUICK, "--preview", path) == 0
-    assert len(seen) == 20
-    original = cv2.cvtColor(read_video(clip).frames[3], cv2.COLOR_RGB2BGR)
-    top, left = 26, 8  # see io.pictures: a band with the title, a margin
-    for picture in seen:
-        np.testing.assert_array_equal(picture[top : top + 48, left : left + 64], original)
-
-    def error(picture):
-        drawn = picture[top : top + 48, 64 + 2 * left : 2 * (64 + left)]
-        return np.mean((drawn.astype(float) - original) ** 2)
-
-    assert error(seen[-1]) < 0.8 * error(seen[0])
-    monkeypatch.undo()
-    assert run("fit", clip, "--out", tmp_path / "2.safetensors", *QUICK, "--preview", path) == 2  # it exists
 
 
 def test_quiet_says_nothing(clip, tmp_path):

@@ -154,6 +154,8 @@ def test_all_kinds_of_chunks_are_equivalent(tmp_path):
     for X, mass in kinds.values():
         _assert_same(whole, _fit(X, mass), 1e-9)
         np.testing.assert_array_equal(np.concatenate(list(whole.predict(X))), whole.predict(x))
+    with pytest.raises(ValueError, match=r"X: expected rows, or chunks of rows, got a dask array\. .*blocks"):
+        _fit(array.from_array(x))
 
 
 @pytest.mark.slow

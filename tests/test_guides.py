@@ -33,7 +33,6 @@ SLOW = {
     "docs/formats.md",
     "docs/index.md",
     "docs/mixture.md",
-    "docs/quickstart.md",
     "docs/rendering.md",
     "docs/results.md",
     "docs/scale.md",

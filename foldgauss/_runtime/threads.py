@@ -129,12 +129,12 @@ def run_tasks(task: Callable[[int], object], items: Iterable[int], *, serial: bo
 
     def drain() -> None:
         while True:
-            with guard:
-                item = next(pending, None)
-            if item is None:
-                return
-            _local.in_task = True
             try:
+                with guard:
+                    item = next(pending, None)
+                if item is None:
+                    return
+                _local.in_task = True
                 _call(task, item)
             except BaseException as error:
                 errors.append(error)

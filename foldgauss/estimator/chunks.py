@@ -27,7 +27,12 @@ class Piece(NamedTuple):
 
 
 def is_chunked(X) -> bool:
-    """Whether X is chunks of rows rather than rows, decided without reading any."""
+    """Whether X is chunks of rows rather than rows, decided without reading any.
+
+    Raises ValueError for a dask array, which would be read into memory as a whole.
+    """
+    cure = "Its blocks, X.blocks.ravel(), are chunks."
+    require(not hasattr(X, "__dask_graph__"), "X", expected="rows, or chunks of rows", got="a dask array", cure=cure)
     if any(hasattr(X, name) for name in ("__array__", "__array_interface__", "__dataframe__", "shape")):
         return False
     if isinstance(X, Sequence) and not isinstance(X, str | bytes):

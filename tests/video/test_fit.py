@@ -180,7 +180,6 @@ def test_interpolated_frames_are_learned():
     assert abs(result.history[-1].psnr - evaluate(result.model, seen).mean_psnr) < 2
 
 
-@pytest.mark.slow
 def test_interpolation_ends():
     """After its last step, a fit goes on from where it is as one without interpolation would."""
     frames, models = moving_blobs(), []

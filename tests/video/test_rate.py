@@ -268,9 +268,7 @@ def over_white(model, frames):
     return evaluate(model, frames, background=(1.0, 1.0, 1.0)).mean_psnr
 
 
-@pytest.mark.parametrize(
-    "clip", ["usual", *(pytest.param(clip, marks=pytest.mark.slow) for clip in ("half of it black", "low contrast"))]
-)
+@pytest.mark.parametrize("clip", ["usual", "half of it black", pytest.param("low contrast", marks=pytest.mark.slow)])
 def test_a_psnr_within_reach_is_reached_by_a_file_that_is_hardly_larger_than_that_of_a_quality(clip):
     frames = texture(6) if clip == "low contrast" else FRAMES.copy()
     frames[: 4 if clip == "half of it black" else 0] = 0
@@ -282,7 +280,6 @@ def test_a_psnr_within_reach_is_reached_by_a_file_that_is_hardly_larger_than_tha
     assert count_bytes(made.quantized) < 1.1 * count_bytes(given.quantized)
 
 
-@pytest.mark.slow
 def test_a_psnr_is_that_over_any_background():
     frames = silhouette()
     config = FitConfig(steps=400, num_gaussians=150)
@@ -469,7 +466,7 @@ EDGES = {
 
 #: Each of these has a neighbor that is farther at the edge, or takes long; the long runs take them.
 SLOW = ("uniform growth", "xla, growth", "two frames", "two steps", "two Gaussians", "degree 7", "no paths", "at rest")
-SLOW += ("black", "any psnr")
+SLOW += ("black",)
 
 
 @pytest.mark.parametrize("name", [pytest.param(k, marks=pytest.mark.slow if k in SLOW else []) for k in EDGES])

@@ -40,11 +40,10 @@ from foldgauss.cli.shared.files import check_output, name_after, refuse_existing
 from foldgauss.cli.shared.fit_progress import (
     Observer,
     display_progress,
-    save_previews,
 )
 from foldgauss.cli.shared.rendering import evaluate_with_progress
 from foldgauss.io import HistoryFile, read_history, write_curves
-from foldgauss.io._atomic import lock_output, resolve
+from foldgauss.io._atomic import lock_output
 from foldgauss.io.media.clip import Clip
 from foldgauss.io.models.compact import COMPACT_SUFFIX
 from foldgauss.io.models.video_model import MODEL_SUFFIX, check_model_name
@@ -83,10 +82,6 @@ def fit(
             help="Write the figures of every step here, and their curves to FILE.png (extra `plot`).",
             rich_help_panel=PROGRESS,
         ),
-    ] = None,
-    preview: Annotated[
-        Path | None,
-        typer.Option(metavar="FILE.png", help="Write a preview image here every 10 s.", rich_help_panel=PROGRESS),
     ] = None,
     checkpoint_seconds: CheckpointSeconds = None,
     segment_seconds: SegmentSeconds = None,
@@ -127,13 +122,14 @@ def fit(
         cure="Give the command that began it, or add --overwrite.",
     )
     if in_segments:
-        for option, path in (("--history", history), ("--preview", preview)):
-            require(path is None, option, expected="a fit in one piece", got="one in segments", cure="Leave it out.")
+        require(
+            history is None, "--history", expected="a fit in one piece", got="one in segments", cure="Leave it out."
+        )
         seconds = SEGMENT_SECONDS if segment_seconds is None else segment_seconds
         fit_in_segments(job, display, options, segment_seconds=seconds, overwrite=overwrite)
         return
-    curves = _check_records(video, history, preview, overwrite or is_begun)
-    record = fit_with_progress(job, display, overwrite=overwrite, history=history, preview=preview)
+    curves = _check_history(video, history, overwrite or is_begun)
+    record = fit_with_progress(job, display, overwrite=overwrite, history=history)
     if history is not None:
         _save_curves(curves, history)
     scores = Evaluation(record["psnr"], record["ssim"])
@@ -165,7 +161,6 @@ def fit_with_progress(
     *,
     overwrite: bool = False,
     history: Path | None = None,
-    preview: Path | None = None,
 ) -> dict[str, Any]:
     """The record of a job that is run here, from its checkpoint unless `overwrite`, with its progress displayed.
 
@@ -181,11 +176,7 @@ def fit_with_progress(
         recorded = None
         if history is not None:
             recorded = HistoryFile(history) if state is None else HistoryFile(history, state.step, running_psnr(state))
-        previews = None if preview is None else save_previews(preview, clip, job.config)
-        with (
-            display_progress(display, "Fitting", history=recorded, preview=previews) as show,
-            note_signals() as request,
-        ):
+        with display_progress(display, "Fitting", history=recorded) as show, note_signals() as request:
 
             def note_step(state: FitState, info: FitInfo) -> bool:
                 request.stepping = True
@@ -218,21 +209,14 @@ def fit_with_progress(
     return record
 
 
-def _check_records(video: Path, history: Path | None, preview: Path | None, overwrite: bool) -> Path:
-    """Refuse invalid paths of the history, its curves and the preview; returns that of the curves."""
-    curves = None if history is None else history.with_suffix(".png")
-    records = ("--history", history, ".jsonl"), ("--history", curves, ".png"), ("--preview", preview, ".png")
-    for option, path, suffix in records:
-        if path is None:
-            continue
-        require(path.suffix == suffix, option, expected=f"a name ending in {suffix}", got=path)
-        check_output(path, overwrite, {"clip": video}, option)
-    require(
-        curves is None or preview is None or resolve(curves) != resolve(preview),
-        "--preview",
-        expected="another file than the curves of --history",
-        got=preview,
-    )
+def _check_history(video: Path, history: Path | None, overwrite: bool) -> Path | None:
+    """Refuse an invalid path of the history; returns that of its curves."""
+    if history is None:
+        return None
+    require(history.suffix == ".jsonl", "--history", expected="a name ending in .jsonl", got=history)
+    curves = history.with_suffix(".png")
+    for path in (history, curves):
+        check_output(path, overwrite, {"clip": video}, "--history")
     return curves
 
 

@@ -89,7 +89,8 @@ def tradeoff_command(
     if path.exists() and not overwrite:
         check_settings(path, settings)
     record = {"settings": settings, "machine": describe_machine(), "points": []}
-    write_json(path, record)
+    if overwrite or not path.exists():
+        write_json(path, record)
     folder, span, source = out_dir.absolute() / MODELS, (parse_size(size), parse_frames(frames)), fingerprint(clip)
 
     def fit_all(points: list[Point], num_done: int = 0) -> dict[str, Outcome]:
@@ -106,6 +107,8 @@ def tradeoff_command(
     done = fit_all([base])["base"]
     require(done.failure is None, "base", expected="a fit of the base", got=done.failure)
     numbers = {name: done.record[name] for name in ("num_gaussians", "steps")}
+    if numbers["steps"] < len(clip.frames):
+        warn(f"--minutes: {numbers['steps']} steps of each fit are too few for {len(clip.frames)} frames.")
     plain = dataclasses.replace(base.config, minutes=None, **numbers)
     points = plan_points(plain, chosen)
     outcomes = fit_all([base, *(point for point in points[1:] if not point.played)], num_done=1)

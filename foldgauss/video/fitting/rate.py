@@ -20,7 +20,7 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Int
+from jaxtyping import Bool, Float, Int
 
 from foldgauss._numerics.random_streams import Stream, make_generator
 from foldgauss._runtime.checks import invalid
@@ -97,6 +97,8 @@ _RISKED_DB = 1.0
 _TRUSTED_FROM = 0.42
 #: Mean squared errors of a frame below this, in [0, 1], count as 0: its PSNR is at its maximum.
 _PERFECT = 1e-10
+#: The gain of a model that was finished already, at most.
+_GAIN_OF_GIVEN = 0.2
 #: The fraction of the gain of an action that is sure.
 _SURE = 0.2
 #: Lambda R / D of a dropping for a PSNR in usual fits of a quality, with the bits of all that are kept then, and by
@@ -278,8 +280,10 @@ class RateControl(DensityControl):
         model = self._model(state)
         worth = Worth(model, self.background)
         coarseness = self._choose_coarseness(state, worth, action)
-        if not state.rules:
-            state.coarseness = max(coarseness, state.coarseness - _MOST_FINER)
+        if not (state.rules or _is_given(state)):
+            state.coarseness = (
+                coarseness if self.config.psnr is None else max(coarseness, state.coarseness - _MOST_FINER)
+            )
         kept = worth.are_worth(coarseness, action.extent)
         least = math.ceil(_LEAST_KEPT * len(kept))
         kept[np.argsort(worth.removal, kind="stable")[-least:]] = True
@@ -346,7 +350,8 @@ class RateControl(DensityControl):
         """
         aim, drops = self.config.psnr + _MARGIN_DB, action.what == "drop"
         adaptation = self._adaptation(state, action)
-        gain = action.gain * float((state.frame_errors > _PERFECT).mean())  # the PSNR of perfect frames does not rise
+        gain = min(action.gain, _GAIN_OF_GIVEN) if _is_given(state) else action.gain
+        gain *= float((self._seen_errors(state) > _PERFECT).mean())  # the PSNR of perfect frames does not rise
         now = self._psnr(self._with_only(state, np.ones(state.num_gaussians, bool)), self.sampled)
 
         def coarsest(most: float, low: float, high: float) -> float:
@@ -368,7 +373,7 @@ class RateControl(DensityControl):
                 low = max(state.coarseness - _MOST_FINER, FINEST)
                 high = state.coarseness + (now + gain - aim) / _DB_PER_UNIT
             return coarsest(_MOST_ROUNDED_DB, low, high)
-        most = _most_dropped_db(state, now)
+        most = _most_dropped_db(state, self._psnr(self._model(state), self.sampled))
         sure_gain = gain if state.rules else _SURE * gain
         sure = coarsest(min(2 * (now + sure_gain - aim), most), FINEST, COARSEST)
         if state.rules:
@@ -402,11 +407,14 @@ class RateControl(DensityControl):
 
     def _typical_psnr(self, state: FitState) -> float:
         """The mean PSNR of the frames as last seen, dB; each at most 100."""
+        return float(np.mean(-10 * np.log10(np.maximum(self._seen_errors(state), _PERFECT))))
+
+    def _seen_errors(self, state: FitState) -> Float[np.ndarray, " seen"]:
+        """The mean squared errors of the frames that were seen; that of all if none was."""
         errors = state.frame_errors.astype(float)
         # After two passes, 0 is the error of a perfect frame; before, that of a frame which was not seen yet.
         is_seen = (errors != 0) | (state.step * self.config.views.batch_size >= 2 * len(errors))
-        seen = -10 * np.log10(np.maximum(errors[is_seen], _PERFECT))
-        return float(seen.mean()) if len(seen) else running_psnr(state)
+        return errors[is_seen] if is_seen.any() else np.array([10 ** (-0.1 * running_psnr(state))])
 
     def _psnr(self, model: VideoModel, which: Int[np.ndarray, " some"]) -> float:
         """Mean PSNR of the frames `which`, dB; with alpha the lower one of each over black and over white."""
@@ -467,6 +475,11 @@ def _most_dropped_db(state: FitState, psnr: float) -> float:
     before, after, now = map(_error_at, (*state.last_drop, psnr))
     left = (now - before) / (after - before) if state.last_drop[0] - state.last_drop[1] >= _LEAST_MEASURED_DB else 0.0
     return _MOST_DROPPED_DB * (1 - min(max(left, 0.0), 1.0)) ** 2
+
+
+def _is_given(state: FitState) -> bool:
+    """Whether the fit began with a finished model; known until rules are chosen."""
+    return not state.coarseness and state.rate_actions > 0
 
 
 def _decode_rules(state: FitState) -> dict[str, Rule]:

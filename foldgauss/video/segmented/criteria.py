@@ -89,7 +89,7 @@ class CriteriaEvaluator:
         """
         positions = self._positions(**arguments) if function is by_time else None
         first, last = positions or (0, self.stand_in.num_frames)
-        parts, motionless = [], []
+        parts, motionless = [], {}
         for number, segment in enumerate(self.segments):
             if within is not None and not len(within[number]):
                 parts.append(within[number])
@@ -101,11 +101,13 @@ class CriteriaEvaluator:
                 try:
                     parts.append(self.evaluate_segment(one, lambda model, _, own=own: function(model, **own)))
                 except NothingMoves as error:
-                    motionless.append(error)
-                    warnings.warn(f"Segment {number}, from frame {segment.first} on: {error}", stacklevel=2)
+                    motionless[number] = error
                     parts.append(self.select_none(number))
         if motionless and len(motionless) == len(parts):
-            raise motionless[0]
+            raise motionless[min(motionless)]
+        for number, error in motionless.items():
+            first = self.segments[number].first
+            warnings.warn(f"Segment {number}, from frame {first} on: {error}", stacklevel=2)
         return parts
 
     def _positions(
