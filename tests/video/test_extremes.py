@@ -1,6 +1,7 @@
 """Extreme clips (one frame, one pixel, black, very long): fit, files and scores without NaN or dark frames."""
 
 import math
+import time
 
 import jax
 import numpy as np
@@ -26,7 +27,7 @@ from foldgauss.video import (
     times_at,
 )
 from foldgauss.video.fitting.config import chosen_num_gaussians
-from foldgauss.video.fitting.loop import start, to_model
+from foldgauss.video.fitting.loop import fit_steps, start, to_model
 from foldgauss.video.models.frame_times import is_cut, make_time_logits, snap_to_shots
 from foldgauss.video.motion.optical_flow import Motion
 
@@ -242,11 +243,12 @@ def test_gaps_exist_only_where_they_are_detected_as_cuts(num_frames, cuts):
 def test_thousands_of_frames_and_few_steps(num):
     """No frame is left dark, though most of them were never looked at; nor does it take long to begin."""
     frames = moving_blobs(50, 8, 8)[np.abs(np.arange(num) % 98 - 49)]
-    result = fit(frames, FitConfig(steps=num // 25, num_gaussians=num))
-    assert result.history[-1].seconds < 0.012 * num
-    shown = np.stack(list(result.model.frames()))
+    config, begun = FitConfig(steps=num // 25, num_gaussians=num), time.process_time()
+    *_, (state, info) = fit_steps(frames, config)
+    assert time.process_time() - begun < 0.012 * num
+    shown = np.stack(list(to_model(state, config, frames.shape[1:3], 25.0).frames()))
     assert (shown.mean((1, 2, 3)) > 0.25 * frames.mean((1, 2, 3))).all()
-    assert math.isfinite(result.history[-1].psnr)
+    assert math.isfinite(info.psnr)
 
 
 def test_long_clips_get_as_many_gaussians_a_frame_as_shorter_ones():
