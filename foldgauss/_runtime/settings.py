@@ -75,7 +75,7 @@ def flatten(values: dict[str, Any]) -> dict[str, Any]:
 
 
 def check_unchanged(parameter: str, before: dict[str, Any], now: dict[str, Any], cure: str) -> None:
-    """Raise ValueError where settings, by names, are others than `before`, those of the run to be continued."""
+    """Raise ValueError if a setting differs from `before`, the settings of the run to be continued."""
     changed = sorted(name for name in now.keys() | before.keys() if now.get(name) != before.get(name))
     expected, got = (", ".join(f"{name}={one.get(name)!r}" for name in changed) for one in (before, now))
     require(not changed, parameter, expected=expected, got=got, cure=cure)

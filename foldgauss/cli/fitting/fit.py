@@ -210,7 +210,7 @@ def fit_with_progress(
 
 
 def _check_history(video: Path, history: Path | None, overwrite: bool) -> Path | None:
-    """Refuse an invalid path of the history; returns that of its curves."""
+    """The path of the curves of a history. Raises ParameterError if either path cannot be written to."""
     if history is None:
         return None
     require(history.suffix == ".jsonl", "--history", expected="a name ending in .jsonl", got=history)

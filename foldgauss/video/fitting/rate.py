@@ -355,7 +355,7 @@ class RateControl(DensityControl):
         now = self._psnr(self._with_only(state, np.ones(state.num_gaussians, bool)), self.sampled)
 
         def coarsest(most: float, low: float, high: float) -> float:
-            """The coarsest one at which the action costs at most so many dB at once, where all of it is made up for."""
+            """The coarsest one at which the action costs at most `most` dB at once, or less if few passes follow."""
             least = min(now - adaptation * most, aim)
 
             def is_reached(coarseness: float) -> bool:
@@ -410,7 +410,7 @@ class RateControl(DensityControl):
         return float(np.mean(-10 * np.log10(np.maximum(self._seen_errors(state), _PERFECT))))
 
     def _seen_errors(self, state: FitState) -> Float[np.ndarray, " seen"]:
-        """The mean squared errors of the frames that were seen; that of all if none was."""
+        """The mean squared errors of the frames that were seen. If none was, the running error."""
         errors = state.frame_errors.astype(float)
         # After two passes, 0 is the error of a perfect frame; before, that of a frame which was not seen yet.
         is_seen = (errors != 0) | (state.step * self.config.views.batch_size >= 2 * len(errors))

@@ -187,7 +187,7 @@ class VideoRenderer:
     def splats(self, t: float) -> Splats2D:
         """The splats of the Gaussians alive at time t, in pixels of an image of `size`; NumPy leaves.
 
-        In the gap of a cut they are those of the nearer shot, in a fade those of the heavier image.
+        In the gap of a cut, the nearer shot is shown. In a fade, these are the splats of the image with more weight.
         """
         return max(self._prepared.weighted_splats(t), key=lambda part: part[0])[1]
 
