@@ -46,7 +46,7 @@ from foldgauss.io import HistoryFile, read_history, write_curves
 from foldgauss.io._atomic import lock_output
 from foldgauss.io.media.clip import Clip
 from foldgauss.io.models.compact import COMPACT_SUFFIX
-from foldgauss.io.models.video_model import MODEL_SUFFIX, check_model_name
+from foldgauss.io.models.video_model import MODEL_SUFFIX
 from foldgauss.jobs import FitJob
 from foldgauss.jobs import Stopped as FitStopped
 from foldgauss.jobs.runner import run_fit
@@ -144,7 +144,13 @@ def _choose_target(video: Path, out_path: Path | None, config: FitConfig) -> tup
     refuse_inputs(out_path, {"clip": video})
     if out_path.suffix.lower() == COMPACT_SUFFIX:
         return out_path, config if config.is_compact else dataclasses.replace(config, quality=DEFAULT_QUALITY)
-    check_model_name(out_path, "--out")
+    require(
+        out_path.suffix.lower() in ("", MODEL_SUFFIX),
+        "--out",
+        expected=f"a name ending in {COMPACT_SUFFIX}, or in {MODEL_SUFFIX} for parameters that are not rounded",
+        got=out_path,
+        cure="Videos and images of a model: foldgauss render. Files of other programs: foldgauss export.",
+    )
     require(
         config.size_mb is None,
         "--size-mb",

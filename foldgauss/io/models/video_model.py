@@ -66,13 +66,13 @@ def save_video_model(
         got=type(model).__name__,
         cure="End the chain with .video()." if isinstance(model, Edit) else "",
     )
-    check_model_name(path)
+    _check_model_name(path)
     if isinstance(model, SegmentedVideo):
         return save_segmented(Path(path), model, metadata)
     return save_model(path, model, metadata=metadata)
 
 
-def check_model_name(path: PathLike, parameter: str = "path") -> None:
+def _check_model_name(path: PathLike) -> None:
     """Raise ValueError for a name with an extension that is another format's."""
     path = Path(path)
     if path.suffix and path.suffix.lower() != MODEL_SUFFIX:
@@ -80,7 +80,7 @@ def check_model_name(path: PathLike, parameter: str = "path") -> None:
         if path.suffix.lower() == COMPACT_SUFFIX:
             cure = "A compact file: foldgauss compress, or foldgauss.video.compress and foldgauss.io.save_compact."
         raise invalid(
-            parameter,
+            "path",
             expected=f"a name for the model, as {path.with_suffix(MODEL_SUFFIX).name}",
             got=repr(str(path)),
             cure=cure,
