@@ -540,6 +540,12 @@ def test_compress_to_a_size(fitted, tmp_path, frames):
     same(load_video_model(path), made.model)
 
 
+def test_a_finished_model_keeps_nearly_its_psnr(fitted):
+    wanted = evaluate(fitted, FRAMES).mean_psnr - 0.6
+    made = compress(fitted, FRAMES, psnr=wanted, steps=200)
+    assert evaluate(made.model, FRAMES).mean_psnr >= wanted - TOLERATED_DB
+
+
 def test_compress_to_a_psnr(fitted):
     made = compress(fitted, FRAMES, psnr=25.0, steps=60)
     assert evaluate(made.model, FRAMES).mean_psnr >= 25
