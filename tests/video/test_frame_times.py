@@ -33,6 +33,17 @@ def test_cuts_of_frames():
     assert isinstance(cuts, np.ndarray)  # JAX would round float64
 
 
+def test_a_single_frame_covers_all_times():
+    one, some = FrameTimes.uniform(1), jnp.asarray([0.0, 0.3, 1.0])
+    assert one.num_frames == 1
+    assert FrameTimes.uniform(5).num_frames == 5
+    assert is_cut(np.zeros(1)).shape == is_cut(one.times()).shape == (0,)
+    np.testing.assert_array_equal(snap_to_shots(some, one.times()), 0)
+    np.testing.assert_array_equal(snap_to_shots(some, FrameTimes.uniform(2).times()), some)
+    with pytest.raises(ValueError, match=r"remap: expected at least two rows .* got \[\[0, nan\]"):
+        remapped_positions([[0, float("nan")], [1, 1]], fps=25)
+
+
 @pytest.mark.parametrize("extreme", [100.0, -100.0, 1e30])
 def test_extreme_weights_stay_in_order(extreme):
     times = np.asarray(FrameTimes(jnp.asarray([0.0, extreme, 1.0])).times())

@@ -356,7 +356,7 @@ class RateControl(DensityControl):
 
         def coarsest(most: float, low: float, high: float) -> float:
             """The coarsest one at which the action costs at most `most` dB at once, or less if few passes follow."""
-            least = min(now - adaptation * most, aim)
+            least = min(now - adaptation * most, aim if drops else aim - adaptation * gain)
 
             def is_reached(coarseness: float) -> bool:
                 if drops:
