@@ -149,7 +149,7 @@ ACTIONS = (
     Action(0.2, "drop", 0.16, 3.3),
     Action(0.3, "drop", 0.36, 2.5),
     Action(0.42, "drop", 0.64, 2.4),
-    Action(0.55, "drop", 1.0, 1.3),
+    Action(0.55, "drop", 1.0, 1.5),
     Action(0.55, "sort"),
     Action(0.7, SHAPE, 0.4, 0.4),
     Action(0.78, SHAPE, 0.75),
