@@ -58,9 +58,9 @@ NAMED = {
 }
 
 
-#: The highest rates in quick runs: one of each end, told of, not finite, and none.
+#: Rates of 10^6 in quick runs: the names that a warning has, or none, differ between these.
 HIGHEST = ("loc", "log_scale", "opacity_logit")
-#: The others in quick runs: the fold, whose rate is told of, and frame times, which pictures alone do not show.
+#: Rates of 10^3 in quick runs. Pictures alone do not show frame times that diverge.
 HIGH = ("coefficients", "frame_times")
 
 

@@ -53,7 +53,7 @@ def hermite_to_powers(degree: int) -> np.ndarray:
 def shift_polynomial(
     coefficients: Float[Array, "*batch k dim"], shift: Float[Array, "*batch"]
 ) -> list[Float[Array, "*batch dim"]]:
-    """The coefficients of p(v + shift), a row for each power of v, from those of p, in JAX or NumPy."""
+    """Coefficients of p(v + shift), given those of p. Row j belongs to v^j. Arrays are of JAX or NumPy."""
     rows = [coefficients[..., j, :] for j in range(coefficients.shape[-2])]
     for start in range(len(rows) - 1):  # Taylor's shift by Horner's scheme
         for j in reversed(range(start, len(rows) - 1)):

@@ -74,7 +74,7 @@ class FoldedGaussianMixture(ClassNamePrefixFeaturesOutMixin, TransformerMixin, D
     **Data larger than memory:** in place of rows (n, d), X may be chunks of rows: an iterable of arrays (n_i, d) that
     can be iterated repeatedly (such as a list; of a dask array, `X.blocks.ravel()`). `sample_weight` is then chunked
     likewise. Every iteration reads all chunks once (twice with an envelope other than "constant"), one after another.
-    The result equals that of the rows in one array, up to rounding.
+    Up to rounding, the result is the same as for a single array with all rows.
 
     **Parameters:**
 

@@ -151,8 +151,8 @@ def _comparison(posterior: FrameTimePosterior, fitted) -> str:
 
 def _conditions(posterior: FrameTimePosterior) -> str:
     lines = [
-        "- The splats, held as fitted: positions, folds, durations, colors. A warp of time that the folds, or the maps "
-        "of an unsteady camera, have absorbed is not visible: intervals are those of times given these.",
+        "- The splats, held as fitted: positions, folds, durations, colors. Folds and the maps of an unsteady camera "
+        "may have absorbed a warp of time. Intervals do not include it.",
         f"- The noise: {posterior.profiles.noise.describe()}.",
         f"- The prior: Dirichlet on the increments, of concentration {posterior.log_prob.concentration:g}.",
         "- The first frame at 0 and the last at 1.",

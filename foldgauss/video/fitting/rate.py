@@ -101,11 +101,11 @@ _PERFECT = 1e-10
 _GAIN_OF_GIVEN = 0.2
 #: The fraction of the gain of an action that is sure.
 _SURE = 0.2
-#: Lambda R / D of a dropping for a PSNR in usual fits of a quality, with the bits of all that are kept then, and by
-#: which power of the fraction of the price it changes.
+#: Lambda R / D in usual fits of a quality, where Gaussians are dropped at the full price. R counts those that are kept.
 _USUAL_COST = 1.3
+#: The power of the fraction of the price by which this ratio changes at earlier droppings.
 _COST_POWER = -0.37
-#: Passes over the frames of usual fits; it falls with them where there are fewer.
+#: Fits of fewer passes over the frames aim at a ratio that is smaller in proportion.
 _USUAL_PASSES = 60.0
 #: By how much more passes are left in a fit by minutes than its speed so far suggests: steps of fewer Gaussians, of
 #: which ever more are rounded, are faster.
@@ -344,9 +344,9 @@ class RateControl(DensityControl):
     def _solve_psnr(self, state: FitState, measured: Worth | Quantizer, action: Action) -> float:
         """The coarseness for the PSNR that is asked for.
 
-        Gaussians are dropped by what they are worth, as in usual fits, but no more than the highest `Action.gain`
-        makes up for, and no less than the lowest one does. Steps of rounding are about as coarse. No action may cost
-        more at once than the rest of the fit makes up for.
+        Gaussians are dropped by what they are worth, as in usual fits. The PSNR bounds this: dropping costs no more
+        than `Action.gain` makes up for, and no less than a fraction of it, `_SURE`, does. Steps of rounding are about
+        as coarse as those of dropping.
         """
         aim, drops = self.config.psnr + _MARGIN_DB, action.what == "drop"
         adaptation = self._adaptation(state, action)
@@ -469,7 +469,7 @@ def _error_at(psnr: float) -> float:
 
 
 def _most_dropped_db(state: FitState, psnr: float) -> float:
-    """How many dB dropping may cost at once, by how much of the error of the last one remains at the present PSNR."""
+    """How many dB dropping may cost at once. It is less if error of the last dropping remains at this PSNR."""
     if not state.last_drop:
         return _FIRST_DROPPED_DB
     before, after, now = map(_error_at, (*state.last_drop, psnr))

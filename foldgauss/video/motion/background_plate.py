@@ -118,7 +118,7 @@ def fill_background(frames: Frames, masks: Masks, *, alignment: Alignment | None
 
     A pixel is the median of the frames that show it, up to `PLATE_REACH` frames away within its shot. One that no
     frame shows is interpolated from its surroundings, with a warning if their fraction is above `MUCH_UNKNOWN`. Pixels
-    away from the masks stay as they are. `alignment` is that of the frames (default: estimated here).
+    away from the masks stay as they are. `alignment` aligns the frames. By default it is estimated.
 
     Raises ValueError for frames of another type, and masks of another size.
     Example: `fill_background(frames, find_moving_object(frames, shadow=True))`.

@@ -108,7 +108,8 @@ def find_moving_object(frames: Frames, *, shadow: bool = False, alignment: Align
     `frames` are uint8 (num_frames, height, width, 3), in which the background fills most of the image and moves as a
     plane does, about: a camera that turns, zooms, or passes a distant scene. Each shot has an object of its own, and
     objects that touch count as one. Masks are empty where it is hidden. `shadow`: with the shadow that it casts.
-    `alignment` is that of the frames (default: estimated here). Shots in which none is found raise a warning.
+    `alignment` aligns the frames. By default it is estimated. A shot without an object gives a
+    warning.
 
     It costs about half a second of processor time for each frame, of any size.
 
