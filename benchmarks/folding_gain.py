@@ -65,7 +65,7 @@ def of_frames(clip: Clip, num_parameters: int, config: FitConfig) -> Run:
     rates |= {"color_dc": RATE_FACTOR}
     scaled = {name: factor * getattr(config.rates, name) for name, factor in rates.items()}
     alone = {"degree": 0, "power": 0.0, "initialization": "static"}
-    alone |= {"rates": LearningRates(**scaled, frame_times=0.0, by_duration=False, by_size=False)}
+    alone |= {"rates": LearningRates(**scaled, frame_times=0.0, own_units=False)}
     models, steps, seconds = [], 0, 0.0
     for k in range(clip.num_frames):
         left = None if config.minutes is None else (config.minutes - seconds / 60) / (clip.num_frames - k)

@@ -44,8 +44,7 @@ def scaled_rates(factor: float) -> dict[str, float]:
 VARIANTS: dict[str, dict[str, Any]] = {
     "starts at rest": {"initialization": "static"},
     "camera not followed": {"follow_camera": False},
-    "rates not by duration": {"rates.by_duration": False},
-    "rates not by size": {"rates.by_size": False},
+    "rates not in own units": {"rates.own_units": False},
     "frame times fixed": {"rates.frame_times": 0.0},
     "low pass 0.3 px^2": {"options": RenderOptions()},
     "Gaussians x0.5": {"gaussians": 0.5},

@@ -15,7 +15,7 @@ import numpy as np
 from jax import lax
 from jax.custom_derivatives import SymbolicZero
 from jax.scipy.special import ndtr, ndtri
-from jaxtyping import Array, ArrayLike, Bool, Float, Key
+from jaxtyping import Array, ArrayLike, Float, Key
 
 from foldgauss._numerics.abstract import AbstractDistribution
 from foldgauss._numerics.batch import (
@@ -255,7 +255,7 @@ def _half_mahalanobis(value, loc, tril, log_scale):
     residual = split_columns(value - loc)
     z = [times_exp(y, -log_scale[..., None]) for y in solve_lower(tril, residual)]
     # A residual that is infinite in one coordinate would give 0 * inf with zeros of L.
-    beyond = _any([jnp.isinf(r) for r in residual])
+    beyond = functools.reduce(operator.or_, map(jnp.isinf, residual)).any(-1)
     return jnp.where(beyond, jnp.inf, _sum([0.5 * y * y for y in z]))
 
 
@@ -291,14 +291,10 @@ def _sum(terms: Columns) -> Float[Array, "*#batch"]:
     return functools.reduce(operator.add, terms).sum(-1)
 
 
-def _any(flags: Columns) -> Bool[Array, "*#batch"]:
-    return functools.reduce(operator.or_, flags).any(-1)
-
-
 @jax.custom_jvp
 def times_exp(y: Float[Array, "*#batch"], c: Float[Array, "*#batch"]):
     """y exp(c), infinite only where the product is, not where exp(c) is."""
-    largest = _log_largest(y.dtype)
+    largest = float(np.log(jnp.finfo(y.dtype).max)) * 0.999  # slightly less: its exp must not round to inf
     half = jnp.exp(0.5 * jnp.clip(c, -2 * largest, 2 * largest))
     return y * half * half
 
@@ -309,7 +305,3 @@ def _times_exp_jvp(primals, tangents):
     product = times_exp(y, c)
     tangent = jnp.zeros_like(product) if isinstance(y_dot, SymbolicZero) else times_exp(y_dot, c)
     return product, tangent if isinstance(c_dot, SymbolicZero) else tangent + product * c_dot  # 0 inf would be NaN
-
-
-def _log_largest(dtype) -> float:
-    return float(np.log(jnp.finfo(dtype).max)) * 0.999  # slightly less: its exp must not round to inf

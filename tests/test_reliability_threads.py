@@ -560,7 +560,7 @@ MADE = """
             "fixed times": change(
                 usual,
                 degree=7,
-                rates=LearningRates(frame_times=0.0, by_duration=False),
+                rates=LearningRates(frame_times=0.0, own_units=False),
                 strategy=Strategy(sparse_updates=False),
             ),
             "uniform": change(usual, initialization="uniform"),

@@ -336,11 +336,14 @@ def _map_eager(function: Callable, structure, wide: list[np.ndarray], batch: tup
     width = next((n for n in _SIZES if size <= n), _CHUNK)
     shapes = tuple(jax.ShapeDtypeStruct((width, *x.shape[len(batch) :]), x.dtype) for x in wide)
     program = _compile_flat(function, structure, shapes)
+    # Values are waited for; tracers, of what a user's function closes over, stay.
+    settle = lambda x: x if isinstance(x, jax.core.Tracer) else np.asarray(x)  # noqa: E731
     results = []
     for start in range(0, size, width):  # not at once: jaxlib's solver for batches can deadlock (`solve_upper_matrix`)
         rows = np.unravel_index(np.minimum(np.arange(start, start + width), size - 1), batch)
-        results.append(jax.tree.map(_as_numpy, program([x[rows] for x in wide])))
-    return jax.tree.map(lambda *parts: _join(parts)[:size], *results)
+        results.append(jax.tree.map(settle, program([x[rows] for x in wide])))
+    join = lambda *parts: (np if isinstance(parts[0], np.ndarray) else jnp).concatenate(parts)[:size]  # noqa: E731
+    return jax.tree.map(join, *results)
 
 
 @functools.lru_cache(maxsize=_PROGRAMS)
@@ -361,15 +364,6 @@ def _known_options() -> dict[str, bool | int] | None:
     except jax.errors.JaxRuntimeError:
         return None
     return _COMPACT
-
-
-def _as_numpy(x: Array) -> Array | np.ndarray:
-    """The values, waited for; tracers, of what a user's function closes over, as they are."""
-    return x if isinstance(x, jax.core.Tracer) else np.asarray(x)
-
-
-def _join(parts: tuple) -> Array | np.ndarray:
-    return (np if isinstance(parts[0], np.ndarray) else jnp).concatenate(parts)
 
 
 @functools.partial(jax.jit, static_argnums=(0, 1))

@@ -194,10 +194,6 @@ def _render_cpu(size, compositing, options, *leaves):
     return _call_on_host(fill, shape, *leaves)
 
 
-def _render_cpu_fwd(size, compositing, options, *leaves):
-    return _render_cpu(size, compositing, options, *leaves), leaves
-
-
 def _render_cpu_bwd(size, compositing, options, leaves, grad_image):
     """Renders again, since a trace is not a JAX value: this costs a third of the backward pass itself."""
 
@@ -212,7 +208,9 @@ def _render_cpu_bwd(size, compositing, options, leaves, grad_image):
     return _call_on_host(differentiate, shapes, grad_image, *leaves)
 
 
-_render_cpu.defvjp(_render_cpu_fwd, _render_cpu_bwd)
+_render_cpu.defvjp(
+    lambda *settings_and_leaves: (_render_cpu(*settings_and_leaves), settings_and_leaves[3:]), _render_cpu_bwd
+)
 
 
 def _call_on_host(function: Callable, shapes, *arrays: jax.Array):

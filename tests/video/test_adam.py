@@ -1,15 +1,19 @@
 """Adam: all implementations agree with each other and with optax; rows that take no part stay."""
 
+import math
+
 import jax
 import numpy as np
 import pytest
+import scipy
 
 from foldgauss.video.fitting.adam import (
     BETA1,
     BETA2,
     EPSILON,
     FRAME_TIME_ADAM,
-    RateUnits,
+    UNIT_SIZE,
+    UNIT_TIME,
     masked_adam,
     sparse_adam,
     update_frame_times,
@@ -28,6 +32,10 @@ def adam_step(grad, first, second, counts, rates):
     return rates * mean / (np.sqrt(square) + EPSILON), first, second
 
 
+def take_step(rows, *others, own_units=False):
+    return sparse_adam(rows, *others, rounded=np.zeros(len(rows), np.uint8), own_units=own_units)
+
+
 def test_untouched_rows_stay_and_each_row_counts_its_own_steps():
     rng = np.random.default_rng(0)
     rows = rng.normal(size=(100, 11)).astype(np.float32)
@@ -37,45 +45,53 @@ def test_untouched_rows_stay_and_each_row_counts_its_own_steps():
     touched = np.array([3, 50, 99])
     grad = np.zeros_like(rows)
     grad[touched] = 1
-    sparse_adam(rows, grad, first, second, counts, touched, rates)
+    take_step(rows, grad, first, second, counts, touched, rates)
     others = np.setdiff1d(np.arange(100), touched)
     np.testing.assert_array_equal(rows[others], before[others])
     np.testing.assert_allclose(rows[touched], before[touched] - 0.1, atol=1e-5)  # a first step is the rate itself
     assert counts.sum() == 3
     grad[3] = 1
-    sparse_adam(rows, grad, first, second, counts, np.array([3]), rates)
+    take_step(rows, grad, first, second, counts, np.array([3]), rates)
     assert list(counts[touched]) == [2, 1, 1]
 
 
 def test_zero_gradient_changes_nothing():
     rows = np.ones((4, 11), np.float32)
     moments = np.zeros_like(rows), np.zeros_like(rows)
-    sparse_adam(rows, np.zeros_like(rows), *moments, np.zeros(4, np.int32), np.arange(4), np.ones(11, np.float32))
+    take_step(rows, np.zeros_like(rows), *moments, np.zeros(4, np.int32), np.arange(4), np.ones(11, np.float32))
     np.testing.assert_array_equal(rows, 1)
 
 
-@pytest.mark.parametrize("unit_size", [0.0, 0.01])
-def test_rates_scale_with_duration_and_size(unit_size):
+@pytest.mark.parametrize("own_units", [False, True])
+def test_rates_scale_with_duration_and_axes(own_units):
     """A first step is the rate itself: c_k moves by (unit / sigma_t)^k of it, m_t by sigma_t / unit; others as ever.
 
-    m_s and c_k also by the size, the geometric mean of the standard deviations.
+    m_s and c_k along each axis of the Gaussian also by its standard deviation; the angle by less if that is long.
     """
-    degree, unit, spread = 3, 0.06, np.array([0.03, 0.06, 0.24], np.float32)
+    degree, spread = 3, np.array([0.03, 0.06, 0.24], np.float32)
     scales = np.array([[0.01, 0.01], [0.02, 0.08], [0.001, 0.004]], np.float32)
-    size = np.sqrt(scales.prod(1)) / unit_size if unit_size else np.ones(3)
+    turns = np.array([0.5, 0.6, 0.07])
+    angles = 2 * np.pi * turns if own_units else np.zeros(3)
+    axes = np.stack([[np.cos(angles), -np.sin(angles)], [np.sin(angles), np.cos(angles)]]).transpose(2, 0, 1)
+    lengths = scales / UNIT_SIZE if own_units else np.ones((3, 2))
+    expected = np.einsum("nij,nj,nj->ni", axes, lengths, np.sign(np.einsum("nij,i->nj", axes, np.ones(2))))
     place = columns(degree)
     rows = np.zeros((3, place["coefficients"].stop), np.float32)
     rows[:, place["log_time_scale"].start] = np.log(spread)
     rows[:, place["log_scale"]] = np.log(scales)
+    rows[:, place["angle_logit"].start] = scipy.special.logit(turns)
     before, grad, moments = rows.copy(), np.ones_like(rows), (np.zeros_like(rows), np.zeros_like(rows))
     rates = np.full(rows.shape[1], 1e-3, np.float32)
-    sparse_adam(rows, grad, *moments, np.zeros(3, np.int32), np.arange(3), rates, units=RateUnits(unit, unit_size))
+    slower = UNIT_TIME / spread if own_units else np.ones(3)
+    take_step(rows, grad, *moments, np.zeros(3, np.int32), np.arange(3), rates, own_units=own_units)
     factor = (before - rows) / 1e-3
     for k in range(1, degree + 1):
         own = factor[:, place["coefficients"]].reshape(3, degree, 2)[:, k - 1]
-        np.testing.assert_allclose(own, (size * (unit / spread) ** k)[:, None] * np.ones(2), rtol=1e-3)
-    np.testing.assert_allclose(factor[:, place["time_loc_logit"].start], spread / unit, rtol=1e-4)
-    np.testing.assert_allclose(factor[:, place["loc"]], size[:, None] * np.ones(2), rtol=1e-3)
+        np.testing.assert_allclose(own, slower[:, None] ** k * expected, rtol=1e-3)
+    np.testing.assert_allclose(factor[:, place["time_loc_logit"].start], 1 / slower, rtol=1e-4)
+    np.testing.assert_allclose(factor[:, place["loc"]], expected, rtol=1e-3)
+    stiff = [1, 4 - 1 / 4, 4 - 1 / 4] if own_units else np.ones(3)
+    np.testing.assert_allclose(factor[:, place["angle_logit"].start], 1 / np.array(stiff), rtol=1e-3)
     np.testing.assert_allclose(factor[:, place["log_time_scale"]], 1, rtol=1e-3)
 
 
@@ -94,10 +110,10 @@ def test_all_implementations_take_the_same_steps(width):
         change, *own[1:3] = adam_step(grad, *own[1:], rates)
         own[0] -= change.astype(np.float32)
         emptied = grad.copy()
-        sparse_adam(sparse[0], emptied, *sparse[1:], np.arange(num), rates)
+        take_step(sparse[0], emptied, *sparse[1:], np.arange(num), rates)
         assert not emptied.any()
         masked = masked_adam(
-            masked[0], grad, *masked[1:], np.ones(num, bool), rates, rounded=np.zeros(num, np.uint8), units=RateUnits()
+            masked[0], grad, *masked[1:], np.ones(num, bool), rates, rounded=np.zeros(num, np.uint8), own_units=False
         )
         with jax.numpy_dtype_promotion("standard"):
             update, moments = FRAME_TIME_ADAM.update(grad, moments)
@@ -119,20 +135,23 @@ def test_a_step_of_the_paths_moves_visited_frames_only():
         np.testing.assert_array_equal(one[~visited], old[~visited])
 
 
-@pytest.mark.parametrize("units", [RateUnits(), RateUnits(0.06, 0.01)])
-def test_masked_adam_matches_sparse_adam(units):
+@pytest.mark.parametrize("own_units", [False, True])
+def test_masked_adam_matches_sparse_adam(own_units):
     """After any number of steps; rows that took no part stay to the bit."""
     rng, num, width = np.random.default_rng(0), 400, 17
     rows, grad, first = (rng.normal(size=(num, width)).astype(np.float32) for _ in range(3))
-    second = (rng.normal(size=(num, width)) ** 2).astype(np.float32)
+    place = columns(3)  # sizes and durations about those that the rates are stated for
+    rows[:, place["log_scale"]] += math.log(UNIT_SIZE)
+    rows[:, place["log_time_scale"]] += math.log(UNIT_TIME)
+    second = (first**2 + rng.normal(size=(num, width)) ** 2).astype(np.float32)  # a mean square is not below that
     counts = rng.integers(0, 30_000, num).astype(np.int32)
     counts[:50] = np.arange(50)
-    touched, rates = rng.random(num) < 0.7, rng.random(width).astype(np.float32)
+    touched, rates = rng.random(num) < 0.7, 0.1 * rng.random(width).astype(np.float32)
     arrays = rows, grad, first, second, counts
     rounded = rng.integers(0, 8, num).astype(np.uint8)
-    own = jax.jit(lambda *arrays: masked_adam(*arrays, touched, rates, rounded=rounded, units=units))(*arrays)
+    own = jax.jit(lambda *arrays: masked_adam(*arrays, touched, rates, rounded=rounded, own_units=own_units))(*arrays)
     judge = [array.copy() for array in arrays]
-    sparse_adam(*judge, np.flatnonzero(touched), rates, rounded=rounded, units=units)
+    sparse_adam(*judge, np.flatnonzero(touched), rates, rounded=rounded, own_units=own_units)
     for one, other, before in zip(own, (judge[0], *judge[2:]), (rows, *arrays[2:]), strict=True):
         np.testing.assert_allclose(one, other, rtol=1e-5, atol=1e-6)
         np.testing.assert_array_equal(np.asarray(one)[~touched], before[~touched])

@@ -60,7 +60,7 @@ GROWING = FitConfig(
     views=Views(batch_size=4, two_cameras=True, interpolation_fraction=0.0),
     power=2.0,
     strategy=Strategy(scale_cutoff=0.004, sparse_updates=False, growth=GROWTH),
-    rates=LearningRates(by_size=False),
+    rates=LearningRates(own_units=False),
     engine="xla",
 )
 
@@ -121,7 +121,7 @@ STEPS = [
             ({"views.interpolation_fraction": 0.0}, 0.1),
             ({"degree": 0}, 0.1),
             ({"floor": 0.1, "power": 0.5}, 0.1),
-            ({"rates.by_duration": False, "rates.frame_times": 0.0}, 0.1),
+            ({"rates.own_units": False, "rates.frame_times": 0.0}, 0.1),
             ({"loss.ssim_fraction": 0.0}, 0.1),
             ({"compositing": "sum", "options": RenderOptions()}, 0.1),
         ]

@@ -73,7 +73,7 @@ def test_learns_a_clip():
         {"floor": 0.1},
         {"steps": None, "minutes": 0.005},
         {"initialization": "static"},
-        {"rates.by_duration": False},
+        {"rates.own_units": False},
         {"views.interpolation_fraction": 0.9, "views.batch_size": 2, "views.two_cameras": True, "psnr": 60.0},
         {"quality": 50.0},
         *(

@@ -47,6 +47,9 @@ BLACK = np.zeros(3, np.float32)
 BEYOND_BLACK = np.full(3, -0.5, np.float32)
 #: Least number of Gaussians from which steps are regressed on features.
 _FEW = 100
+#: By how much the binary logarithm of a step may be too large for a Gaussian: the finest step that one needs otherwise
+#: determines the steps of all.
+_TOO_COARSE = 1.5
 _MIN_SENSITIVITY = 1e-4  # below, a Gaussian is not visible
 #: Levels of an 8-bit image.
 LEVELS = 255.0
@@ -118,7 +121,8 @@ class Quantizer:
             self._fits[name] = fit
             rest.append(levels[name] - whole @ fit)
         # Of usual Gaussians at most 6. Beyond, the class makes up for the line where a Gaussian is unlike the others.
-        classes = np.where(np.all(raw == features, axis=1), np.clip(rest, -6, 6), np.clip(rest, -60, 60)).mean(0)
+        most = np.where(np.all(raw == features, axis=1), 6, 60)
+        classes = np.maximum(np.clip(rest, -most, most).mean(0), np.max(rest, 0) - _TOO_COARSE)
         self.classes = np.rint(np.where(self._seen, classes, -6.0)).astype(np.int32)
         # All columns are to add the same error: by mean, not typical, sensitivity times step^2.
         for name, fit in self._fits.items():

@@ -11,7 +11,6 @@ counts its own steps, so that its bias correction is right however seldom the Ga
 """
 
 import math
-from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -20,7 +19,7 @@ import numpy as np
 import optax
 from jaxtyping import Array, Bool, Float
 
-from foldgauss._runtime.kernels import kernel
+from foldgauss._runtime.kernels import inline, kernel
 from foldgauss._runtime.threads import run_tasks
 from foldgauss.video.models.frame_times import CUT_RATIO, FrameTimes
 from foldgauss.video.models.row_layout import columns, group_bits
@@ -31,39 +30,51 @@ BETA1 = 0.9
 BETA2 = 0.999
 #: As in the published 3DGS.
 EPSILON = 1e-15
-#: 1 / (1 - beta^n) for both betas, by the number n of steps; beyond the table it is 1 in float32. (Computing the powers
-#: for each row took a third of a step's optimizer.)
-BIAS_CORRECTIONS = np.ones((20_000, 2), np.float32)
-BIAS_CORRECTIONS[1:] = 1 / (1 - np.array([BETA1, BETA2]) ** np.arange(1, len(BIAS_CORRECTIONS))[:, None])
 FRAME_TIME_ADAM = optax.scale_by_adam(BETA1, BETA2, EPSILON)
 
 _CHUNK = 2048  # rows per task
 _f = nb.float32
 _u = nb.uint64
 
+#: The sigma_t at which the learning rates of positions, folds and m_t are stated.
+UNIT_TIME = 0.06
+#: The standard deviation at which they are stated, in units of the frame's longer side.
+UNIT_SIZE = 0.005
+#: 1 / (1 - beta^n) for both betas, by the number n of steps; beyond the table it is 1 in float32. (Computing the powers
+#: for each row took a third of a step's optimizer.)
+BIAS_CORRECTIONS = np.ones((20_000, 2), np.float32)
+BIAS_CORRECTIONS[1:] = 1 / (1 - np.array([BETA1, BETA2]) ** np.arange(1, len(BIAS_CORRECTIONS))[:, None])
 
-class RateUnits(NamedTuple):
-    """The sigma_t and size at which the learning rates of positions, folds and m_t are stated; 0: they are absolute.
 
-    A Gaussian's size is the geometric mean of its two standard deviations. See `config.LearningRates`.
-    """
-
-    time: float = 0.0
-    size: float = 0.0
+def _find_degree(rows) -> int:
+    return (rows.shape[1] - columns(0)["coefficients"].start) // 2
 
 
-ABSOLUTE = RateUnits()
+def _vector_columns(degree: int) -> np.ndarray:
+    """The first columns of m_s and of each c_k, which a second one follows."""
+    place = columns(degree)
+    return np.array([place["loc"].start, *range(place["coefficients"].start, place["coefficients"].stop, 2)])
 
 
 # ----------------------------------------------------------------------------------- rows of Gaussians, Numba
 
 
+@inline
+def _turn(row, at, cos, sin):
+    """Turn the pairs of columns that begin at `at` by an angle, in place."""
+    for c in at:
+        x, y = row[c], row[c + 1]
+        row[c], row[c + 1] = cos * x - sin * y, sin * x + cos * y
+
+
 @kernel
-def _update(start, stop, touched, rows, grad, first, second, counts, rounded, bits, rates, units, at, corrections):
+def _update(
+    start, stop, touched, rows, grad, first, second, counts, rounded, bits, rates, own_units, at, vectors, corrections
+):
     beta1, beta2 = _f(BETA1), _f(BETA2)
     own = rates.copy()
-    loc, scale, spread, time, fold = at
-    width = _u(fold + 2 * ((rows.shape[1] - fold) // 2))  # without the column of paths, which is not trained
+    scale, angle, spread, time = at
+    width = _u(len(bits))  # without the column of paths, which is not trained
     total = 0.0
     for k in range(start, stop):
         i = touched[k]
@@ -71,28 +82,31 @@ def _update(start, stop, touched, rows, grad, first, second, counts, rounded, bi
         taken = min(counts[i], len(corrections) - 1)
         correction1, correction2 = corrections[taken, 0], corrections[taken, 1]
         row, g, m, v = rows[i], grad[i], first[i], second[i]
-        size, short = _f(1.0), _f(1.0)
-        if units.size > _f(0.0):
-            size = math.exp(_f(0.5) * (row[scale] + row[scale + 1])) / units.size
-            own[loc], own[loc + 1] = rates[loc] * size, rates[loc + 1] * size
-        if units.time > _f(0.0):
-            wide = math.exp(row[spread]) / units.time
+        along, across, cos, sin, power, short = _f(1.0), _f(1.0), _f(1.0), _f(0.0), _f(1.0), _f(1.0)
+        if own_units:
+            along, across = math.exp(row[scale]) / _f(UNIT_SIZE), math.exp(row[scale + 1]) / _f(UNIT_SIZE)
+            own[angle] = rates[angle] / max(abs(along / across - across / along), _f(1.0))
+            turned = _f(2 * math.pi) / (_f(1.0) + math.exp(-row[angle]))
+            cos, sin = math.cos(turned), math.sin(turned)
+            wide = math.exp(row[spread]) / _f(UNIT_TIME)
             own[time] = rates[time] * wide
             short = _f(1.0) / wide
-        power = size
-        for c in range(fold, width, 2):
+        for c in vectors:
+            own[c], own[c + 1] = rates[c] * along * power, rates[c + 1] * across * power
             power *= short
-            own[c], own[c + 1] = rates[c] * power, rates[c + 1] * power
         if rounded[i]:
             for c in range(width):
                 if rounded[i] & bits[c]:
                     g[c] = _f(0.0)
+        _turn(g, vectors, cos, -sin)
         for c in range(width):
-            gradient = g[c]
+            m[c] = beta1 * m[c] + (_f(1.0) - beta1) * g[c]
+            v[c] = beta2 * v[c] + (_f(1.0) - beta2) * g[c] * g[c]
+            g[c] = own[c] * m[c] * correction1 / (math.sqrt(v[c] * correction2) + _f(EPSILON))
+        _turn(g, vectors, cos, sin)
+        for c in range(width):
+            row[c] -= g[c]
             g[c] = _f(0.0)
-            m[c] = beta1 * m[c] + (_f(1.0) - beta1) * gradient
-            v[c] = beta2 * v[c] + (_f(1.0) - beta2) * gradient * gradient
-            row[c] -= own[c] * m[c] * correction1 / (math.sqrt(v[c] * correction2) + _f(EPSILON))
             total += row[c]
     return total
 
@@ -106,29 +120,27 @@ def sparse_adam(
     touched: np.ndarray,
     rates: np.ndarray,
     *,
-    rounded: np.ndarray | None = None,
-    units: RateUnits = ABSOLUTE,
+    rounded: np.ndarray,
+    own_units: bool,
 ) -> bool:
     """One step on the rows `touched`, in place; their gradients are set to zero. Returns whether they are finite.
 
     `rows`, `grad` and the moments `first`, `second`: float32 (num, width); `counts`: int32 (num,), steps taken by each
     row; `rates`: float32 (width,), learning rates by column. `rounded`, uint8 (num,): bits of the groups of leaves
-    (`row_layout.GROUPS`) whose gradients are ignored. `units`: how rates are scaled by each Gaussian's duration and
-    size.
+    (`row_layout.GROUPS`) whose gradients are ignored. `own_units`: rates are scaled by each Gaussian's axes and
+    duration, see `config.LearningRates`.
     """
-    place = columns(0)  # the fold comes last, so its degree does not shift these
-    names = ("loc", "log_scale", "log_time_scale", "time_loc_logit", "coefficients")
-    at = tuple(place[name].start for name in names)
-    num = len(touched)
-    units = RateUnits(*np.float32(units))
-    rounded = np.zeros(len(rows), np.uint8) if rounded is None else rounded
-    bits = group_bits((rows.shape[1] - at[-1]) // 2)
+    degree = _find_degree(rows)
+    names = ("log_scale", "angle_logit", "log_time_scale", "time_loc_logit")
+    at = tuple(columns(degree)[name].start for name in names)
+    num, vectors = len(touched), _vector_columns(degree)
+    bits = group_bits(degree)
     sums = np.zeros(-(-num // _CHUNK))
 
     def work(start: int) -> None:
         stop = min(start + _CHUNK, num)
         arrays = touched, rows, grad, first, second, counts, rounded, bits
-        sums[start // _CHUNK] = _update(start, stop, *arrays, rates, units, at, BIAS_CORRECTIONS)
+        sums[start // _CHUNK] = _update(start, stop, *arrays, rates, own_units, at, vectors, BIAS_CORRECTIONS)
 
     run_tasks(work, range(0, num, _CHUNK))
     return math.isfinite(sums.sum())
@@ -137,34 +149,41 @@ def sparse_adam(
 # ------------------------------------------------------------------------------------- rows of Gaussians, JAX
 
 
-def masked_adam(rows, grad, first, second, counts, touched, rates, *, rounded, units: RateUnits):
+def masked_adam(rows, grad, first, second, counts, touched, rates, *, rounded, own_units: bool):
     """`sparse_adam` in JAX: rows, moments and counts after a step on the rows where `touched`, bool (num,), is true."""
-    degree = (rows.shape[1] - columns(0)["coefficients"].start) // 2
+    degree = _find_degree(rows)
     bits = np.zeros(rows.shape[1], np.uint8)
     bits[: columns(degree)["coefficients"].stop] = group_bits(degree)
     grad = jnp.where((rounded[:, None] & bits[None]) > 0, np.float32(0), grad)
     counts = counts + touched.astype(counts.dtype)
     corrections = jnp.asarray(BIAS_CORRECTIONS)[jnp.minimum(counts, len(BIAS_CORRECTIONS) - 1)]
     beta1, beta2, one = np.float32(BETA1), np.float32(BETA2), np.float32(1)
+    factors, angle = _own_units(rows, degree) if own_units else (jnp.ones_like(rows), jnp.zeros_like(rows[:, 0]))
+    grad = _turn_vectors(grad, degree, -angle)
     mean = beta1 * first + (one - beta1) * grad
     square = beta2 * second + (one - beta2) * grad * grad
-    own = rates[None, :] * _rate_factors(rows, degree, units)
-    moved = rows - own * mean * corrections[:, :1] / (jnp.sqrt(square * corrections[:, 1:]) + np.float32(EPSILON))
-    chosen = touched[:, None]
+    change = rates[None, :] * factors * mean * corrections[:, :1]
+    change /= jnp.sqrt(square * corrections[:, 1:]) + np.float32(EPSILON)
+    moved, chosen = rows - _turn_vectors(change, degree, angle), touched[:, None]
     return jnp.where(chosen, moved, rows), jnp.where(chosen, mean, first), jnp.where(chosen, square, second), counts
 
 
-def _rate_factors(rows, degree: int, units: RateUnits) -> Float[Array, "num width"]:
-    """The factors by which each Gaussian's size and duration scale its learning rates, see `config.LearningRates`."""
-    place, (of_size, of_time) = columns(degree), np.zeros((2, rows.shape[1]), np.float32)
-    of_size[place["loc"]] = of_size[place["coefficients"]] = 1
-    of_time[place["time_loc_logit"]], of_time[place["coefficients"]] = 1, -np.repeat(np.arange(1, degree + 1), 2)
-    size = time = jnp.zeros_like(rows[:, 0])  # logarithms
-    if units.size > 0:
-        size = rows[:, place["log_scale"]].mean(axis=1) - np.float32(math.log(units.size))
-    if units.time > 0:
-        time = rows[:, place["log_time_scale"].start] - np.float32(math.log(units.time))
-    return jnp.exp(size[:, None] * of_size[None] + time[:, None] * of_time[None])
+def _turn_vectors(rows, degree: int, angle: Float[Array, " num"]) -> Float[Array, "num width"]:
+    at, cos, sin = _vector_columns(degree), jnp.cos(angle)[:, None], jnp.sin(angle)[:, None]
+    x, y = rows[:, at], rows[:, at + 1]
+    return rows.at[:, at].set(cos * x - sin * y).at[:, at + 1].set(sin * x + cos * y)
+
+
+def _own_units(rows, degree: int) -> tuple[Float[Array, "num width"], Float[Array, " num"]]:
+    """The factors of the learning rates by each Gaussian's own units, and the angle of its axes."""
+    place, at = columns(degree), _vector_columns(degree)
+    axes = jnp.exp(rows[:, place["log_scale"]]) / np.float32(UNIT_SIZE)
+    wide = jnp.exp(rows[:, place["log_time_scale"]]) / np.float32(UNIT_TIME)
+    ratio, short = axes[:, :1] / axes[:, 1:], wide ** -np.arange(len(at), dtype=np.float32)[None]
+    factors = jnp.ones_like(rows).at[:, place["angle_logit"]].set(1 / jnp.maximum(jnp.abs(ratio - 1 / ratio), 1))
+    factors = factors.at[:, place["time_loc_logit"]].set(wide)
+    factors = factors.at[:, at].set(axes[:, :1] * short).at[:, at + 1].set(axes[:, 1:] * short)
+    return factors, 2 * math.pi * jax.nn.sigmoid(rows[:, place["angle_logit"].start])
 
 
 # ------------------------------------------------------------------------------------- shared paths, frame times

@@ -10,7 +10,6 @@ from foldgauss._runtime.settings import check_settings, replace_settings, settin
 from foldgauss._runtime.threads import num_threads
 from foldgauss.render import COMPOSITINGS, RenderOptions
 from foldgauss.render.camera import FIELD_OF_VIEW
-from foldgauss.video.fitting.adam import RateUnits
 from foldgauss.video.fitting.losses import LOSSES
 from foldgauss.video.models.row_layout import MAX_DEGREE
 
@@ -18,10 +17,6 @@ from foldgauss.video.models.row_layout import MAX_DEGREE
 MODEL = "model"
 BUDGET = "budget"
 OPTIMIZATION = "optimization"
-#: The sigma_t, and the size in units of the frame's longer side, at which the learning rates of positions, folds and
-#: m_t are stated.
-UNIT_TIME = 0.06
-UNIT_SIZE = 0.005
 #: The most Gaussians of a fit. Their state takes about 3 GB at degree 3; the paper's largest fit ends with 1.8 million.
 MAX_GAUSSIANS = 10_000_000
 #: The default of `Views.interpolation_fraction`.
@@ -42,6 +37,12 @@ MIN_EVERY = 10
 MIN_RESET_EVERY = 200
 
 
+#: The default of `LearningRates.final` in fits of at most `FINAL_PASSES` passes.
+FINAL = 0.3
+#: With more passes over the frames, noise of the gradients adds up to more, and rates decay further.
+FINAL_PASSES = 100.0
+
+
 def _rate(leaf: str, default: float) -> Any:
     return field(default=default, metadata=setting(f"Of {leaf}", bounds="[0, inf)"))
 
@@ -50,27 +51,32 @@ def _rate(leaf: str, default: float) -> Any:
 class LearningRates:
     """Learning rates of Adam at the first step, by leaf, in model space (the frame's longer side is 1); their schedule.
 
-    With `by_size` the unit of length is each Gaussian's own size s, the geometric mean of its standard deviations: the
-    learning rates of m_s and c_k are `loc` and `coefficients` times s / UNIT_SIZE.
-    With `by_duration` the unit of time is its own duration: the learning rate of c_k is `coefficients` times
+    With `own_units` the unit of length is each Gaussian's own: m_s and c_k move along its two axes, with the learning
+    rates `loc` and `coefficients` times the standard deviation along each axis / UNIT_SIZE. With r the ratio of both,
+    the learning rate of the angle is divided by r - 1/r where this exceeds 1.
+    The unit of time is its own duration: the learning rate of c_k is `coefficients` times
     (UNIT_TIME / sigma_t)^k, that of m_t is `time_loc_logit` sigma_t / UNIT_TIME. That of a path is `paths` times
-    s / UNIT_SIZE, with s the mean size of the Gaussians.
+    s / UNIT_SIZE, with s the mean of the sizes, the geometric means of both standard deviations.
     A step then moves small and large, short and long Gaussians by the same fraction of their sizes and durations.
     """
 
-    loc: float = _rate("m_s", 3.5e-4)
-    coefficients: float = _rate("the fold's coefficients c_k", 2e-3)
-    log_scale: float = _rate("the logarithms of the standard deviations in space", 0.03)
-    angle_logit: float = _rate("the angle, before its sigmoid", 0.03)
-    opacity_logit: float = _rate("the opacity, before its sigmoid", 0.075)
+    loc: float = _rate("m_s", 5e-4)
+    coefficients: float = _rate("the fold's coefficients c_k", 4e-3)
+    log_scale: float = _rate("the logarithms of the standard deviations in space", 0.06)
+    angle_logit: float = _rate("the angle, before its sigmoid", 0.05)
+    opacity_logit: float = _rate("the opacity, before its sigmoid", 0.1)
     color_dc: float = _rate("the color", 0.03)
     time_loc_logit: float = _rate("m_t, before its sigmoid", 0.02)
-    log_time_scale: float = _rate("log sigma_t", 0.05)
+    log_time_scale: float = _rate("log sigma_t", 0.07)
     frame_times: float = _rate("the times of the frames, which stay as they start if it is 0", 3e-3)
     paths: float = _rate("the maps of shared paths", 7e-4)
-    final: float = field(
-        default=0.2,
-        metadata=setting("Learning rates decay exponentially to this fraction of these values", bounds="[0, 1]"),
+    final: float | None = field(
+        default=None,
+        metadata=setting(
+            "Learning rates decay exponentially to this fraction of these values",
+            bounds="[0, 1]",
+            unset=f"{FINAL:g}; less in proportion in fits of more than {FINAL_PASSES:g} passes over the frames",
+        ),
     )
     cooldown: float = field(
         default=0.2,
@@ -83,16 +89,12 @@ class LearningRates:
     decayed: str = field(
         default="all", metadata=setting("Which learning rates decay: all, or that of positions", choices=("all", "loc"))
     )
-    by_duration: bool = field(default=True, metadata=setting("Learning rates are in units of each Gaussian's duration"))
-    by_size: bool = field(default=True, metadata=setting("Learning rates are in units of each Gaussian's size"))
+    own_units: bool = field(
+        default=True, metadata=setting("Learning rates are in units of each Gaussian's axes and duration")
+    )
 
     def __post_init__(self) -> None:
         check_settings(self, "rates.")
-
-    @property
-    def units(self) -> RateUnits:
-        """The units in which the learning rates are stated."""
-        return RateUnits(UNIT_TIME if self.by_duration else 0.0, UNIT_SIZE if self.by_size else 0.0)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -318,8 +320,7 @@ PUBLISHED_RATES = LearningRates(
     final=0.01,
     cooldown=0.0,
     decayed="loc",
-    by_duration=False,
-    by_size=False,
+    own_units=False,
 )
 #: Standard deviations, in its units, above which the published code renders a Gaussian.
 PUBLISHED_SCALE_CUTOFF = 1e-4

@@ -47,6 +47,7 @@ from foldgauss.video.compression.streams import encode_chunk, encode_motion
 from foldgauss.video.fitting.budget import measure_progress
 from foldgauss.video.fitting.config import FitConfig
 from foldgauss.video.fitting.density_control import DensityControl
+from foldgauss.video.fitting.schedule import count_passes
 from foldgauss.video.fitting.state import FitState, running_psnr, to_model
 from foldgauss.video.models.background import BLACK, WHITE, Background, composite
 from foldgauss.video.models.metrics import psnr as psnr_of
@@ -92,7 +93,7 @@ _MOST_DROPPED_DB = 4.5
 #: The same where nothing was dropped before.
 _FIRST_DROPPED_DB = 2.0
 #: How many dB it may cost before `_TRUSTED_FROM`, whatever the PSNR is.
-_RISKED_DB = 1.0
+_RISKED_DB = 0.5
 #: The fraction of the plan from which on the PSNR alone tells how much may be dropped.
 _TRUSTED_FROM = 0.42
 #: Mean squared errors of a frame below this, in [0, 1], count as 0: its PSNR is at its maximum.
@@ -145,11 +146,11 @@ class Action(NamedTuple):
 
 
 ACTIONS = (
-    Action(0.1, "drop", 0.04, 4.0),
-    Action(0.2, "drop", 0.16, 3.3),
-    Action(0.3, "drop", 0.36, 2.5),
-    Action(0.42, "drop", 0.64, 2.4),
-    Action(0.55, "drop", 1.0, 1.5),
+    Action(0.1, "drop", 0.04, 2.8),
+    Action(0.2, "drop", 0.16, 2.3),
+    Action(0.3, "drop", 0.36, 1.8),
+    Action(0.42, "drop", 0.64, 1.7),
+    Action(0.55, "drop", 1.0, 1.1),
     Action(0.55, "sort"),
     Action(0.7, SHAPE, 0.4, 0.4),
     Action(0.78, SHAPE, 0.75),
@@ -266,7 +267,7 @@ class RateControl(DensityControl):
         return min(self._count_passes(state.plan - state.step) / _PASSES, 1.0)
 
     def _count_passes(self, steps: int) -> float:
-        passes = steps * self.config.views.batch_size / len(self.frames)
+        passes = count_passes(self.config, len(self.frames), steps)
         return passes if self.config.minutes is None else _SPEEDUP * passes
 
     def _model(self, state: FitState, fps: float = 25.0) -> VideoModel:
@@ -398,16 +399,11 @@ class RateControl(DensityControl):
         kept = [worth.are_worth(coarseness, action.extent).sum() for coarseness in grid]
         costs = [bit_price(coarseness) * USUAL_BITS * num for coarseness, num in zip(grid, kept, strict=True)]
         part = _USUAL_COST * min(self._count_passes(state.plan) / _USUAL_PASSES, 1.0)
-        limit = part * action.extent**_COST_POWER * _error_at(self.config.psnr) * self._error_at_0_db(state)
+        # All frames are assumed to differ by as many dB from now; each has at most 100.
+        typical = np.mean(-10 * np.log10(np.maximum(self._seen_errors(state), _PERFECT)))
+        missing = self.config.psnr - typical + running_psnr(state)
+        limit = part * action.extent**_COST_POWER * 255**2 * _error_at(missing) * self.frames[..., :3].size
         return float(grid[np.argmax(np.minimum(costs, limit))])  # the first of enough, or the most
-
-    def _error_at_0_db(self, state: FitState) -> float:
-        """The squared error of a clip with a mean PSNR of 0 dB, if all frames differ by as many dB from now."""
-        return 255**2 * 10 ** (0.1 * (self._typical_psnr(state) - running_psnr(state))) * self.frames[..., :3].size
-
-    def _typical_psnr(self, state: FitState) -> float:
-        """The mean PSNR of the frames as last seen, dB; each at most 100."""
-        return float(np.mean(-10 * np.log10(np.maximum(self._seen_errors(state), _PERFECT))))
 
     def _seen_errors(self, state: FitState) -> Float[np.ndarray, " seen"]:
         """The mean squared errors of the frames that were seen. If none was, the running error."""

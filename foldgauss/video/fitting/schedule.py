@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 
 from foldgauss._numerics.random_streams import Stream, make_generator
-from foldgauss.video.fitting.config import FitConfig
+from foldgauss.video.fitting.config import FINAL, FINAL_PASSES, FitConfig
 from foldgauss.video.models.row_layout import columns
 
 #: Frames whose errors tell how good the start is.
@@ -28,6 +28,11 @@ def num_views(config: FitConfig, num_frames: int) -> int:
 def steps_per_pass(config: FitConfig, num_frames: int) -> int:
     """Steps in which every view is seen at least once."""
     return math.ceil(num_views(config, num_frames) / (config.views.batch_size * (1 - config.views.error_fraction)))
+
+
+def count_passes(config: FitConfig, num_frames: int, steps: int) -> float:
+    """Passes over the frames in so many steps."""
+    return steps * config.views.batch_size / num_frames
 
 
 def choose_views(config: FitConfig, num_frames: int, step: int, errors: np.ndarray) -> np.ndarray:
@@ -69,13 +74,16 @@ def choose_start_frames(num_frames: int) -> np.ndarray:
 # ------------------------------------------------------------------------------------------ learning rates
 
 
-def learning_rates(config: FitConfig, progress: float, backoffs: int) -> tuple[np.ndarray, np.float32, np.float32]:
-    """Adam's learning rates at a fraction of the plan and after back-offs.
+def learning_rates(
+    config: FitConfig, progress: float, backoffs: int, passes: float
+) -> tuple[np.ndarray, np.float32, np.float32]:
+    """Adam's learning rates at a fraction of a plan of so many passes over the frames, and after back-offs.
 
     They are those of rows by column, float32 (width,), of frame times, and of the maps of shared paths.
     """
     rates, slower = config.rates, BACKOFF_FACTOR**-backoffs
-    decay = rates.final**progress if rates.final > 0 else 1 - progress
+    final = FINAL / max(passes / FINAL_PASSES, 1.0) if rates.final is None else rates.final
+    decay = final**progress if final > 0 else 1 - progress
     if 1 - progress < rates.cooldown:
         decay *= COLD + (1 - COLD) * ((1 - progress) / rates.cooldown)
     rows = np.empty(columns(config.fold_degree)["coefficients"].stop, np.float32)

@@ -19,6 +19,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Float32
 
 from foldgauss.envelope import TimeLikelihood
+from foldgauss.video.fitting.adam import UNIT_SIZE
 from foldgauss.video.fitting.config import FitConfig
 from foldgauss.video.models.conditioning import ConditioningSpec
 from foldgauss.video.models.frame_times import FrameTimes
@@ -78,10 +79,6 @@ def _array(dtype: type, *shape: int | str) -> dict[str, Any]:
     return {"arrays": StateArray(dtype, shape)}
 
 
-def _decode_errors(pairs: Any) -> tuple[tuple[int, float], ...]:
-    return tuple((int(frame), float(error)) for frame, error in pairs)
-
-
 def _decode_rules(rows: Any) -> tuple[tuple[str, float, float, tuple[float, ...]], ...]:
     return tuple((str(name), float(origin), float(exponent), tuple(slopes)) for name, origin, exponent, slopes in rows)
 
@@ -90,7 +87,7 @@ def _decode_rules(rows: Any) -> tuple[tuple[str, float, float, tuple[float, ...]
 _FLAG = {"static": True, "decode": bool}
 _COUNT = {"static": True, "decode": int}
 _NUMBER = {"static": True, "decode": float}
-_ERRORS = {"static": True, "decode": _decode_errors}
+_ERRORS = {"static": True, "decode": lambda pairs: tuple((int(frame), float(error)) for frame, error in pairs)}
 _RULES = {"static": True, "decode": _decode_rules}
 _NUMBERS = {"static": True, "decode": tuple}
 #: The names of the maps of shared paths, of their moments, and of the frames' counts of steps.
@@ -320,19 +317,19 @@ def paths_of(state: FitState, times: Float32[np.ndarray, " frames"] | None = Non
     return SharedPaths(times, np.swapaxes(state.path_maps, 0, 1).copy())
 
 
-@functools.partial(jax.jit, static_argnames="unit")
+@functools.partial(jax.jit, static_argnames="own_units")
 def measure_relative_size(
-    log_scales: Float[Array, "num 2"], used: Bool[Array, " num"], *, unit: float
+    log_scales: Float[Array, "num 2"], used: Bool[Array, " num"], *, own_units: bool
 ) -> Float[Array, ""]:
     """The size of Gaussians, in units of that at which the learning rate of paths is stated; 1 if it is absolute.
 
     Their geometric mean, at most that of the frame, of those that are `used`: every `SIZE_STRIDE`-th of a fit.
     """
-    if not unit:
+    if not own_units:
         return jnp.float32(1)
     sizes = jnp.where(used, jnp.mean(log_scales, axis=1), 0)
     mean = jnp.sum(sizes) / jnp.sum(used).astype(jnp.float32)
-    return jnp.where(jnp.isfinite(mean), jnp.exp(jnp.minimum(mean, 0)) / np.float32(unit), 1)
+    return jnp.where(jnp.isfinite(mean), jnp.exp(jnp.minimum(mean, 0)) / np.float32(UNIT_SIZE), 1)
 
 
 def running_psnr(state: FitState) -> float:

@@ -10,7 +10,13 @@ from foldgauss.render import cpu
 from foldgauss.video.fitting.adam import sparse_adam, update_frame_times, update_paths
 from foldgauss.video.fitting.config import FitConfig
 from foldgauss.video.fitting.losses import LOSSES
-from foldgauss.video.fitting.schedule import choose_start_frames, learning_rates, steps_per_pass, to_planes
+from foldgauss.video.fitting.schedule import (
+    choose_start_frames,
+    count_passes,
+    learning_rates,
+    steps_per_pass,
+    to_planes,
+)
 from foldgauss.video.fitting.state import (
     PATH_ARRAYS,
     SIZE_STRIDE,
@@ -92,10 +98,11 @@ class CpuStepper:
         if not config.strategy.sparse_updates:
             touched = np.arange(len(state.rows))
         scales = state.rows[::SIZE_STRIDE, columns(config.fold_degree)["log_scale"]].copy()  # before the step
-        rates, time_rate, path_rate = learning_rates(config, progress, state.backoffs)
-        moments, units = (state.first, state.second, state.counts), config.rates.units
-        arrays = state.rows, self.grad, *moments, touched
-        finite = sparse_adam(*arrays, rates, rounded=state.rounded, units=units)
+        passes = count_passes(config, num_frames, state.plan)
+        rates, time_rate, path_rate = learning_rates(config, progress, state.backoffs, passes)
+        own_units = config.rates.own_units
+        arrays = state.rows, self.grad, state.first, state.second, state.counts, touched
+        finite = sparse_adam(*arrays, rates, rounded=state.rounded, own_units=own_units)
         update_windows(state.rows, touched, self.window, spec)
         if config.learns_frame_times and num_frames > 2:
             moments = state.time_count, state.time_first, state.time_second
@@ -103,7 +110,7 @@ class CpuStepper:
             state.time_count, state.time_first, state.time_second = moments
         if by_path.size:
             every = np.ones(len(scales), bool)
-            rate = path_rate * measure_relative_size(scales, every, unit=config.rates.units.size)
+            rate = path_rate * measure_relative_size(scales, every, own_units=own_units)
             before = tuple(getattr(state, name) for name in PATH_ARRAYS)
             with np.errstate(over="ignore"):  # of a fit that diverges
                 after = update_paths(before, np.float32(by_path), visited, rate)

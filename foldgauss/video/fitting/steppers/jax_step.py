@@ -18,7 +18,7 @@ from jaxtyping import Array, Bool, Float, Int, UInt8
 from foldgauss.envelope import TimeLikelihood
 from foldgauss.render import RenderOptions, Splats2D, render
 from foldgauss.render.tiles import find_visible
-from foldgauss.video.fitting.adam import RateUnits, masked_adam, update_frame_times, update_paths
+from foldgauss.video.fitting.adam import masked_adam, update_frame_times, update_paths
 from foldgauss.video.fitting.config import Loss
 from foldgauss.video.fitting.state import (
     PATH_ARRAYS,
@@ -84,7 +84,7 @@ class Program:
     own_loss: Callable[[Array, Array], Array] | None  # of `register_loss`
     batch_size: int
     sparse_updates: bool
-    rate_units: RateUnits
+    own_units: bool
     learns_times: bool
     grows: bool
     interpolates: bool
@@ -153,7 +153,7 @@ def step(program: Program, arrays: DeviceArrays, frames: UInt8[Array, "frames he
     moments, before = (arrays.first, arrays.second, arrays.counts), arrays.rows
     rates = jnp.pad(control.rates, (0, program.width - program.num_trained))
     rows, first, second, counts = masked_adam(
-        arrays.rows, seen.by_rows, *moments, touched, rates, rounded=arrays.rounded, units=program.rate_units
+        arrays.rows, seen.by_rows, *moments, touched, rates, rounded=arrays.rounded, own_units=program.own_units
     )
     logits, of_times = arrays.time_logits, (arrays.time_count, arrays.time_first, arrays.time_second)
     if program.learns_times:
@@ -162,7 +162,7 @@ def step(program: Program, arrays: DeviceArrays, frames: UInt8[Array, "frames he
     if program.num_paths:
         scales = before[::SIZE_STRIDE, columns(program.degree)["log_scale"]]
         of_stride = jnp.arange(0, program.capacity, SIZE_STRIDE, dtype=jnp.int32) < control.num
-        rate = control.path_rate * measure_relative_size(scales, of_stride, unit=program.rate_units.size)
+        rate = control.path_rate * measure_relative_size(scales, of_stride, own_units=program.own_units)
         of_paths = tuple(getattr(arrays, name) for name in PATH_ARRAYS)
         of_paths = update_paths(of_paths, seen.by_paths, seen.errors >= 0, rate)
         arrays = arrays._replace(**dict(zip(PATH_ARRAYS, of_paths, strict=True)))

@@ -12,7 +12,13 @@ import numpy as np
 
 from foldgauss.video.fitting.config import FitConfig, chosen_num_gaussians, most_gaussians
 from foldgauss.video.fitting.losses import LOSSES
-from foldgauss.video.fitting.schedule import choose_start_frames, find_views_in_turn, learning_rates, steps_per_pass
+from foldgauss.video.fitting.schedule import (
+    choose_start_frames,
+    count_passes,
+    find_views_in_turn,
+    learning_rates,
+    steps_per_pass,
+)
 from foldgauss.video.fitting.state import STATISTICS, DeviceArrays, FitState, StepResult, frame_times
 from foldgauss.video.fitting.steppers.interpolated_frames import Prefetcher, choose_targets, make_interpolated
 from foldgauss.video.fitting.steppers.jax_step import (
@@ -112,7 +118,8 @@ class JaxStepper:
             state.fetch_all()
             self.adopt(state)
         held, config = state.held, self.config
-        rates, time_rate, path_rate = learning_rates(config, progress, state.backoffs)
+        passes = count_passes(config, self.num_frames, state.plan)
+        rates, time_rate, path_rate = learning_rates(config, progress, state.backoffs, passes)
         views, fractions = choose_targets(self.interpolation, config, self.num_frames, state, progress)
         control = Control(
             views=views.astype(np.int32),
@@ -196,7 +203,7 @@ class JaxStepper:
             own_loss=LOSSES[config.loss.name],
             batch_size=config.views.batch_size,
             sparse_updates=config.strategy.sparse_updates,
-            rate_units=config.rates.units,
+            own_units=config.rates.own_units,
             learns_times=config.learns_frame_times and self.num_frames > 2,
             grows=config.strategy.growth is not None,
             interpolates=self.interpolation is not None,
