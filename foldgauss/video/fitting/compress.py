@@ -61,7 +61,7 @@ def compress(
         compositing=model.compositing,
         options=model.options,
         strategy=Strategy(relocated_fraction=0.0, scale_cutoff=model.scale_cutoff),
-        rates=LearningRates(final=0.1),  # what is fitted already loses less by lower rates
+        rates=LearningRates(final=0.07),  # what is fitted already loses less by lower rates
         views=Views(interpolation_fraction=0.0),
     )
     if frames is None:

@@ -78,6 +78,8 @@ _TOLERANCE_LOG2 = 0.02
 _SLOPE_LOG2 = 0.8
 #: By how many dB dropping has to worsen the images at once for what remains of it to be measured.
 _LEAST_MEASURED_DB = 0.05
+#: The coarseness of dropping where no PSNR can be spared.
+_LEAST_DROPPED = -COARSEST
 #: How finely the coarseness is searched for a PSNR.
 _TOLERANCE = 0.1
 #: Frames that a PSNR is estimated by.
@@ -146,11 +148,11 @@ class Action(NamedTuple):
 
 
 ACTIONS = (
-    Action(0.1, "drop", 0.04, 2.8),
-    Action(0.2, "drop", 0.16, 2.3),
-    Action(0.3, "drop", 0.36, 1.8),
-    Action(0.42, "drop", 0.64, 1.7),
-    Action(0.55, "drop", 1.0, 1.1),
+    Action(0.1, "drop", 0.04, 2.7),
+    Action(0.2, "drop", 0.16, 2.2),
+    Action(0.3, "drop", 0.36, 1.7),
+    Action(0.42, "drop", 0.64, 1.6),
+    Action(0.55, "drop", 1.0, 1.0),
     Action(0.55, "sort"),
     Action(0.7, SHAPE, 0.4, 0.4),
     Action(0.78, SHAPE, 0.75),
@@ -324,14 +326,14 @@ class RateControl(DensityControl):
             wanted.append(self._solve_psnr(state, measured, action))
         if config.size_mb is not None:
             wanted.append(self._solve_size(state, measured, action))
-        return min(max(*wanted, FINEST), COARSEST)
+        return min(max(wanted), COARSEST)
 
     def _solve_size(self, state: FitState, measured: Worth | Quantizer, action: Action) -> float:
         """The coarseness for the largest file: by the number of Gaussians that it holds, and for rounding by coding."""
         room = _AIM * 1e6 * self.config.size_mb
         if action.what == "drop":  # at first more than it holds
             num = 8 * max(room - HEADER_BYTES, 0.0) / USUAL_BITS / math.sqrt(action.extent)
-            return measured.coarseness_for(num, action.extent)
+            return max(measured.coarseness_for(num, action.extent), FINEST)
         streams = max(room - HEADER_BYTES, 64.0)
 
         def excess(coarseness: float) -> float:
@@ -376,7 +378,7 @@ class RateControl(DensityControl):
             return coarsest(_MOST_ROUNDED_DB, low, high)
         most = _most_dropped_db(state, self._psnr(self._model(state), self.sampled))
         sure_gain = gain if state.rules else _SURE * gain
-        sure = coarsest(min(2 * (now + sure_gain - aim), most), FINEST, COARSEST)
+        sure = coarsest(min(2 * (now + sure_gain - aim), most), _LEAST_DROPPED, COARSEST)
         if state.rules:
             return sure
         spare = max(2 * (now + gain - aim), _RISKED_DB if action.progress < _TRUSTED_FROM else 0.0)
