@@ -22,7 +22,7 @@ SIZE = (160, 320)
 FRAMES = (0, 24)
 RECORD = "metrics.json"
 FILES = ("model.fgz", "reconstruction.mp4", "comparison.png", RECORD)
-CONFIG = FitConfig(num_gaussians=40_000, steps=1500, quality=80)
+CONFIG = FitConfig(num_gaussians=40_000, steps=1200, quality=80)
 
 
 @command("demo")

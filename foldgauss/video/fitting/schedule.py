@@ -31,7 +31,7 @@ def steps_per_pass(config: FitConfig, num_frames: int) -> int:
 
 
 def count_passes(config: FitConfig, num_frames: int, steps: int) -> float:
-    """Passes over the frames in so many steps."""
+    """The number of passes over the frames in `steps` steps."""
     return steps * config.views.batch_size / num_frames
 
 
@@ -77,7 +77,7 @@ def choose_start_frames(num_frames: int) -> np.ndarray:
 def learning_rates(
     config: FitConfig, progress: float, backoffs: int, passes: float
 ) -> tuple[np.ndarray, np.float32, np.float32]:
-    """Adam's learning rates at a fraction of a plan of so many passes over the frames, and after back-offs.
+    """Adam's learning rates at a fraction of a plan and after back-offs. `passes`: those of the plan over the frames.
 
     They are those of rows by column, float32 (width,), of frame times, and of the maps of shared paths.
     """
