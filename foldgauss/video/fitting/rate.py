@@ -137,8 +137,8 @@ class Action(NamedTuple):
     """What is done after a fraction of the plan: "drop", "sort", "divide" into chunks, or the group of leaves to round.
 
     `extent`: the fraction of the price of a bit at which Gaussians are dropped, or of the Gaussians that are rounded.
-    `gain`: by how many dB at most the PSNR of the finished model is above the mean of those before and after a
-    dropping, or above that before rounding, in usual fits of a quality.
+    `gain`: by how many dB at most the finished model is expected to exceed the mean PSNR before and after a dropping,
+    or the PSNR before rounding. It is about 0.7 times the rise in fits of a quality.
     """
 
     progress: float
@@ -348,8 +348,8 @@ class RateControl(DensityControl):
         """The coarseness for the PSNR that is asked for.
 
         Gaussians are dropped by what they are worth, as in usual fits. The PSNR bounds this: dropping costs no more
-        than `Action.gain` makes up for, and no less than a fraction of it, `_SURE`, does. Steps of rounding are about
-        as coarse as those of dropping.
+        than `Action.gain` makes up for, and no less than a fraction of it, `_SURE`, does. Rounding is about as
+        coarse as dropping.
         """
         aim, drops = self.config.psnr + _MARGIN_DB, action.what == "drop"
         adaptation = self._adaptation(state, action)

@@ -77,7 +77,7 @@ def choose_start_frames(num_frames: int) -> np.ndarray:
 def learning_rates(
     config: FitConfig, progress: float, backoffs: int, passes: float
 ) -> tuple[np.ndarray, np.float32, np.float32]:
-    """Adam's learning rates at a fraction of a plan and after back-offs. `passes`: those of the plan over the frames.
+    """Adam's learning rates at a fraction of a plan that visits each frame `passes` times, and after back-offs.
 
     They are those of rows by column, float32 (width,), of frame times, and of the maps of shared paths.
     """
