@@ -42,10 +42,10 @@ TARGETS = {
         "test_distribution_extremes",
         "test_distribution_conditional",
     ],
-    "analysis/conditional": ["test_distribution_conditional"],
+    "analysis/conditional": ["test_distribution_conditional", "test_batch_shapes", "test_interop"],
     "envelope": ["test_envelope", "test_distribution"],
     "fold": ["test_fold", "test_distribution"],
-    "mixture": ["test_mixture", "test_interop"],
+    "mixture": ["test_mixture", "test_batch_shapes", "test_interop"],
     "estimator/em/loop": ["test_em", "test_em_chunks", "test_estimator"],
     "estimator/em/m_step": ["test_em", "test_estimator"],
     "estimator/em/statistics": ["test_em", "test_em_chunks", "test_estimator"],
@@ -138,7 +138,7 @@ def _mutations(node: ast.AST) -> Iterator[tuple[str, ast.AST]]:
         case ast.Constant(float() as value):
             yield f"{value} -> {2 * value + 1}", ast.Constant(2 * value + 1)
         case ast.If(test, body, orelse):
-            yield "if never", ast.If(ast.Constant(False), body, orelse)
+            yield "if never", ast.If(ast.BoolOp(ast.And(), [test, ast.Constant(False)]), body, orelse)
         case ast.IfExp(test, body, orelse):
             yield "if always", body
         case ast.Call(ast.Attribute(value, name, ctx), args, keywords) if name in _CALLS:

@@ -469,7 +469,9 @@ def test_values_are_not_looked_at_under_tracing_or_on_request():
     jax.eval_shape(lambda scale: folded(time_scale=scale).log_prob(jnp.zeros(3)), -1.0)
     own = lambda t, m, scale: jnp.exp(-jnp.abs(t - m) / scale)  # noqa: E731
     jax.eval_shape(lambda scale: folded(time_scale=scale, envelope=own).log_prob(jnp.zeros(3)), 1.0)
-    folded(time_scale=-1.0, loc=jnp.full(2, jnp.nan), envelope=own, validate_args=False)
+    broken = folded(time_scale=-1.0, loc=jnp.full(2, jnp.nan), envelope=own, validate_args=False)
+    assert np.isnan(broken.condition_time(0.3).loc).all()
+    assert np.isnan(broken.marginal([0, -1]).loc).all()
 
 
 def test_a_function_that_returns_a_instead_of_its_logarithm_is_refused():

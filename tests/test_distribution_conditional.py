@@ -213,15 +213,16 @@ def test_space_marginal_is_the_law_of_the_samples():
         np.testing.assert_allclose(own, whole[:1])
 
 
-@pytest.mark.slow
-def test_density_is_the_slope_of_the_distribution_function():
+@pytest.mark.parametrize("given", [*(pytest.param(k, marks=pytest.mark.slow) for k in (0, 1)), 2])
+def test_density_is_the_slope_of_the_distribution_function(given):
+    dist = folded(given + 1).marginal(range(given + 1))
+    dist = dist.condition(range(given), [0.3, -0.1][:given]) if given else dist
     nodes, weights = np.polynomial.legendre.leggauss(60)
-    for dist in (folded(2).marginal([1]), folded(2).condition([0], [0.3]).marginal([0])):
-        x = jnp.asarray(0.25 * nodes)[:, None]
-        mass = weights @ jnp.exp(LOG_PROB(dist, x)) * 0.25
-        ends = CDF(dist, jnp.array([[-0.25], [0.25]]))
-        np.testing.assert_allclose(mass, ends[1] - ends[0], atol=1e-9)
-        assert (dist.error_estimate(x) < 1e-9).all()
+    x = jnp.asarray(0.25 * nodes)[:, None]
+    mass = weights @ jnp.exp(LOG_PROB(dist, x)) * 0.25
+    ends = CDF(dist, jnp.array([[-0.25], [0.25]]))
+    np.testing.assert_allclose(mass, ends[1] - ends[0], atol=1e-9)
+    assert (dist.error_estimate(x) < 1e-9).all()
 
 
 def test_space_given_space_against_its_definition():
@@ -578,6 +579,7 @@ def test_indices_are_checked(indices, expected):
     ("request_of", "message"),
     [
         (lambda dist: dist.marginal([2, 0]), "indices: expected time last, got "),
+        (lambda _: folded(3).condition(0, [0.1]).marginal([0, 2, 1]), "indices: expected time last, got "),
         (
             lambda dist: dist.condition([0, 1, 2], np.zeros(3)),
             "indices: expected at least one coordinate that is not given, got all",

@@ -8,7 +8,7 @@ import pytest
 from scipy import special
 
 from foldgauss.envelope import Constant, TimeLikelihood, plain_envelope
-from foldgauss.estimator.em import components, loop
+from foldgauss.estimator.em import components, loop, statistics
 from foldgauss.estimator.em.loop import EMStatus, run_em, select_best
 from foldgauss.estimator.em.m_step import (
     _MAX_STEP,
@@ -89,10 +89,35 @@ def test_gram_is_the_sum_over_pairs(x64, dim):
     hermite = np.stack([np.ones_like(v), v, (v * v - 1) / np.sqrt(2)], -1)
     z = np.concatenate([hermite, np.stack(pairs.whitened, -1).reshape(N, K, dim)], -1)
     np.testing.assert_allclose(sums.mass, shares.sum(0), rtol=1e-12)
+    assert len(sums.gram) == 1  # without derivatives
     gram = np.einsum("nk,nka,nkb->kab", shares * np.exp(-np.asarray(pairs.log_a)), z, z)
     np.testing.assert_allclose(sums.gram[0], gram, rtol=1e-10, atol=1e-9)
     split = SUMS(params, ENVELOPES["1"], make_points(x, weights, 2**13))  # 16 rows a chunk
     np.testing.assert_allclose(split.gram, sums.gram, rtol=1e-10, atol=1e-9)
+
+
+def test_a_point_of_weight_zero_adds_nothing_however_far(x64):
+    far, weights = _data(), np.append(np.ones(N - 1), 0.0)
+    far[-1, 0] = 1e200  # its density is 0, whose logarithm is infinite
+    sums = [SUMS(_params(), Constant(), make_points(x, weights, K)) for x in (far, _data())]
+    jax.tree.map(np.testing.assert_array_equal, *sums)
+
+
+@pytest.mark.parametrize("devices", [1, 3])
+def test_pieces_of_any_lengths_fill_one_block_where_they_fit(monkeypatch, devices):
+    monkeypatch.setattr(statistics, "make_points", lambda x, weights, *rest: (x, weights, rest[-1]))
+    x, weights = np.arange(4096.0)[:, None], np.arange(4096.0)
+    pieces = [(x[a:b], weights[a:b]) for a, b in ((0, 5), (5, 5), (5, 3000), (3000, 4096))]
+    ((whole, same, size),) = statistics.make_blocks(pieces, 4096, K, devices)
+    np.testing.assert_array_equal(whole, x)
+    np.testing.assert_array_equal(same, weights)
+    assert 4096 <= size < 2 * 4096
+
+
+@pytest.mark.parametrize(("dtype", "expected"), [(np.float64, np.float64), (np.float32, np.float32)])
+def test_only_float64_changes_the_users_setting(dtype, expected):
+    with statistics.enable_dtype(dtype):
+        assert jnp.ones(()).dtype == expected
 
 
 @pytest.mark.parametrize("covariance", ["full", "diag", "spherical", "tied"])
@@ -130,7 +155,8 @@ def test_each_restart_ends_for_itself(x64, monkeypatch):
 
     def step(states, *rest):
         info = loop.Info(values[next(numbers)], np.ones((3, K)), np.zeros((3, K), bool), np.zeros(3))
-        return states, jax.tree.map(jnp.asarray, info)
+        later = states.params._replace(time_loc=states.params.time_loc + 1)
+        return states._replace(params=later), jax.tree.map(jnp.asarray, info)
 
     monkeypatch.setattr(loop, "step", step)
     starts = jax.tree.map(lambda z: jnp.stack([z] * 3), _params())
@@ -138,6 +164,65 @@ def test_each_restart_ends_for_itself(x64, monkeypatch):
     assert [len(run.history) for run in runs] == [2, 2, 4]
     assert [run.status for run in runs] == [EMStatus.CONVERGED, EMStatus.NOT_FINITE, EMStatus.CONVERGED]
     assert [run.log_likelihood for run in runs] == [1.0, 1.0, 2.0]
+    # The second goes back to what its last finite likelihood was of.
+    moved = [run.params.time_loc - _params().time_loc for run in runs]
+    np.testing.assert_allclose(moved, np.repeat([[2.0], [0.0], [4.0]], K, 1), rtol=1e-12)
+
+
+def _steps_with_mass(monkeypatch, *masses):
+    """`loop.step` leaves the components as they are, and finds these masses."""
+    left = iter(masses)
+
+    def step(states, *rest):
+        mass = jnp.asarray([next(left)])
+        return states, loop.Info(jnp.ones(1), mass, jnp.zeros(mass.shape, bool), jnp.zeros(1))
+
+    monkeypatch.setattr(loop, "step", step)
+
+
+def test_an_empty_component_is_reset_to_half_of_the_heaviest(x64, monkeypatch):
+    """Both are shifted apart by a standard deviation along its longest axis. The next one takes half of a half."""
+    _steps_with_mass(monkeypatch, [0.6, 0.25, 0.0, 0.0], [0.25] * 4)
+    params = jax.tree.map(lambda z: jnp.concatenate([z, z[:1]]), _params())
+    run = _run(None, params, Constant(), _model(), 1.0, least_mass=0.01, max_steps=2)
+    weights = np.exp(params.log_weights)
+    np.testing.assert_allclose(np.exp(run.params.log_weights), [*weights[:2] / [4, 1], *weights[0] / [2, 4]])
+    for name in ("time_loc", "time_scale", "tril"):
+        np.testing.assert_array_equal(getattr(run.params, name), getattr(params, name)[jnp.array([0, 1, 0, 0])])
+    shift = run.params.curve[:, 0] - params.curve[jnp.array([0, 1, 0, 0]), 0]
+    np.testing.assert_allclose(shift[0], -2 * shift[2], atol=1e-12)
+    np.testing.assert_allclose([shift[1], shift[3]], 0, atol=1e-12)
+    variances, axes = np.linalg.eigh(params.tril[0] @ params.tril[0].T)
+    np.testing.assert_allclose(np.abs(axes.T @ shift[2]), [0, 0.5 * np.sqrt(variances[1])], atol=1e-12)
+
+
+def test_components_are_reset_as_often_as_there_are_some(x64, monkeypatch):
+    _steps_with_mass(monkeypatch, *[[0.6, 0.4, 0.0]] * 9)
+    run = _run(None, _params(), Constant(), _model(), 1.0, least_mass=0.01, max_steps=9)
+    assert len(run.history) == K + 1  # without a reset it has converged
+
+
+def test_only_annealing_moves_components_that_coincide(x64, monkeypatch):
+    for annealing in (1.0, 0.5):
+        _steps_with_mass(monkeypatch, *[[0.5] * K] * 9)
+        run = _run(None, _params(), Constant(), _model(), 1.0, annealing=annealing, max_steps=9, tol=0.0)
+        assert (run.params.curve == _params().curve).all() == (annealing == 1.0)
+
+
+def test_a_rejected_step_of_times_is_repeated_at_a_quarter(x64, monkeypatch):
+    monkeypatch.setattr(loop, "_ARMIJO", 1e9)  # more than any step gains
+    params = jax.tree.map(lambda z: jnp.concatenate([z, z[:2]])[None], _params())  # a shape that no other test compiles
+    model = Model(jnp.full(5, DEGREE, jnp.int32), jnp.zeros(3), "full")
+    states = loop.State(params, jnp.full((1, 5), 0.5))
+    new, info = loop.step(states, make_points(_data(), np.ones(N), 5), ENVELOPES["1"], model)
+    np.testing.assert_array_equal(new.step_fraction, np.full((1, 5), 0.125))
+    assert info.rejected > 0
+
+
+def test_a_run_that_is_not_finite_is_selected_last():
+    broken = loop.Run(_params(), [-1.0, np.nan], EMStatus.NOT_FINITE)
+    whole = loop.Run(_params(), [-5.0], EMStatus.NOT_CONVERGED)
+    assert select_best([broken, whole]) is whole
 
 
 def test_temperatures_of_annealing(x64, monkeypatch):

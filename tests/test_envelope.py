@@ -93,6 +93,13 @@ def test_far_away_values_and_gradients_are_finite(dtype):
         assert (values[floors > 0] >= math.log(0.01) - 1e-6).all()
 
 
+def test_distances_whose_squares_are_too_large_are_clipped():
+    bound, scales = 1e-2 * math.sqrt(np.finfo(np.float32).max), np.array([[0.25], [4.0]], np.float32)
+    taus = bound * np.array([0.5, 3.0], np.float32)
+    log_a = LOG_A(TimeLikelihood(), t=scales * taus, time_loc=np.float32(0), time_scale=scales)
+    np.testing.assert_allclose(log_a, np.tile(-0.5 * np.minimum(taus, bound) ** 2, (2, 1)), rtol=1e-5)
+
+
 def test_gradients_equal_finite_differences(x64):
     def log_a(x):
         t, power, floor, time_loc, time_scale = x

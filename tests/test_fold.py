@@ -284,6 +284,19 @@ def path_gaussians(num=5, dtype=np.float64, **changes) -> FoldedGaussian:
     return FoldedGaussian(fold.home, scale=scale, time_loc=time_loc, time_scale=dtype(0.2), fold=fold)
 
 
+def test_breaks_of_a_path_are_its_knots_and_those_of_its_own_fold():
+    """As u, seen from m_t; on no path those of any."""
+    own = FOLDS["spline"]()
+    for index, path in ((0, 0), (1, 0), (2, 1)):
+        fold = SharedPathFold(own, [0.3, -1.0], time_loc=0.25, index=index, **PATHS)
+        np.testing.assert_allclose(fold.breaks, [*(0.25 - PATHS["times"][path]), *own.breaks], rtol=1e-6)
+
+
+@pytest.mark.parametrize("fold", FOLDS)
+def test_only_functions_of_users_are_not_closed(fold):
+    assert FOLDS[fold]().is_closed == (fold not in ("function", "pytree"))
+
+
 def test_a_piecewise_path_ends_at_its_last_knot():
     """Also where several knots are equal at the end, in JAX and NumPy."""
     times, t = np.array([[-0.5, 0.2, 0.2], [0.1, 0.1, 0.7]]), np.array([[-1.0, 0.2, 0.5, 9.0], [0.0, 0.1, 0.4, 9.0]])

@@ -244,6 +244,27 @@ def test_marginals_and_conditionals_know_their_own(x64):
     )
 
 
+def test_a_mixture_of_mixtures_is_one_of_all_their_components():
+    rng, weights = np.random.default_rng(0), np.array([[0.2, 0.3, 0.5], [0.6, 0.3, 0.1]])
+    loc, tril = rng.normal(size=(6, 2)), np.broadcast_to(0.5 * np.eye(2), (6, 2, 2))
+    flat = Mixture(Gaussian(loc, tril), weights=(weights * [[0.25], [0.75]]).ravel())
+    inner = Mixture(Gaussian(loc.reshape(2, 3, 2), tril.reshape(2, 3, 2, 2)), weights=weights)
+    outer, x = Mixture(inner, weights=[0.25, 0.75]), rng.normal(size=(8, 2)).astype(np.float32)
+    np.testing.assert_allclose(outer.log_prob(x), flat.log_prob(x), rtol=1e-5)
+    np.testing.assert_allclose(outer.covariance_matrix, flat.covariance_matrix, rtol=1e-5)
+    given = [one.condition([0], [0.3]).log_prob(x[:, 1:]) for one in (outer, flat)]
+    np.testing.assert_allclose(*given, rtol=1e-5)
+    draws = outer.sample(jax.random.key(0), (20_000,))
+    error = jnp.sqrt(flat.variance / len(draws))
+    assert (jnp.abs(draws.mean(0) - flat.mean) < ALARM * error).all()
+
+
+def test_one_point_of_space_has_the_density_of_its_components():
+    line, s = _mixture().marginal([0]), jnp.array([0.2])
+    expected = special.logsumexp(line.components.log_prob(s) + np.log(WEIGHTS))
+    np.testing.assert_allclose(line.log_prob(s), expected, rtol=1e-5)
+
+
 # --- weights of zero, and points far away ---------------------------------------------------------------------
 
 
@@ -289,6 +310,8 @@ def test_cdf_and_quantiles_of_a_gaussian_mixture(x64):
     assert quantiles.shape == (4, 2, 1)
     np.testing.assert_allclose(one.cdf(quantiles), np.broadcast_to(levels, (4, 2)), rtol=1e-9)
     assert np.isneginf(one.icdf(0.0)).all()
+    half = Mixture(one.components, logits=np.log([[np.nan] * 3, [0.3, 0.4, 0.3]]), validate_args=False)
+    np.testing.assert_array_equal(np.isnan(half.icdf(0.5)), [[True], [False]])
     pair = Mixture(Gaussian(np.zeros((2, 2)), np.eye(2)), weights=[0.5, 0.5])
     for function in (pair.icdf, lambda _: pair.cdf(jnp.zeros(2))):
         with pytest.raises(ValueError, match="expected a single coordinate"):
@@ -334,6 +357,8 @@ def test_nothing_of_a_broken_component_without_weight_is_seen():
     assert np.isfinite(mixture.log_prob(x)).all()
     assert np.isfinite(mixture.mean).all()
     np.testing.assert_allclose(mixture.responsibilities(x).sum(-1), 1, rtol=1e-6)
+    line = Gaussian([[0.0], [np.nan], [1.0]], np.ones((3, 1, 1), np.float32), validate_args=False)
+    np.testing.assert_allclose(Mixture(line, weights=[0.5, 0.0, 0.5]).icdf(0.5), [0.5], rtol=1e-5)
 
 
 def test_far_points_and_offsets():

@@ -93,5 +93,5 @@ class AbstractDistribution(BatchModule):
 
     def _sample_from(self, key: Key[Array, ""], sample_shape: tuple[int, ...], component: Array) -> Array:
         """A sample of one of the components, which are the last batch axis: here of those that all are drawn from."""
-        every = self._sample(key, sample_shape)
+        every = self.sample(key, sample_shape)
         return jnp.take_along_axis(every, component[..., None, None], axis=component.ndim).squeeze(component.ndim)

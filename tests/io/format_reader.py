@@ -75,7 +75,7 @@ LOGISTIC = [_logistic(d) for d in range(-2048, 2048)]
 STRETCH = [next((d for d in range(-2048, 2048) if LOGISTIC[d + 2048] >= 16 * i + 8), 2047) for i in range(4096)]
 
 
-class _Numbers:
+class Numbers:
     """The numbers of a stream, one after another."""
 
     def __init__(self, stream):
@@ -144,7 +144,7 @@ def _level(x):
     return sum(abs(x) >= bound for bound in bounds)
 
 
-def _signed_level(r):
+def signed_level(r):
     return 16 + _level(r) if r >= 0 else 16 - _level(r)
 
 
@@ -152,7 +152,7 @@ def _signed_level(r):
 
 
 def _motion(header, streams):
-    numbers = _Numbers(streams[0])
+    numbers = Numbers(streams[0])
     logits = [numbers.next(0, 0, 0) * 2.0 ** -header["time_bits"] for _ in range(header["num_frames"] - 1)]
     numbers.end()
     arrays = {"frame_times": _single(logits)}
@@ -163,15 +163,15 @@ def _motion(header, streams):
     if paths["at_frames"]:
         times = [_frame_times(logits)] * num_paths
     else:
-        numbers = _Numbers(streams[1])
+        numbers = Numbers(streams[1])
         steps = [[numbers.next(0, 0, 0) for _ in range(num_knots)] for _ in range(num_paths)]
         numbers.end()
         times = np.cumsum(np.array(steps, np.int64), 1) * 2.0**-24
-    numbers, maps, one = _Numbers(streams[2]), [], 2 ** paths["bits"]
+    numbers, maps, one = Numbers(streams[2]), [], 2 ** paths["bits"]
     for _ in range(num_paths):
         place, before = [one, 0, 0, 0, one, 0], None
         for _ in range(num_knots):
-            third = [0] * 6 if before is None else [_signed_level(own) for own in before]
+            third = [0] * 6 if before is None else [signed_level(own) for own in before]
             before = [numbers.next(i, 0, third[i]) for i in range(6)]
             place = [x + step for x, step in zip(place, before, strict=True)]
             maps.append(place)
@@ -206,7 +206,7 @@ class _Chunk:
         self.header, self.num, self.bits = header, chunk["num_gaussians"], chunk["cells"]
         self.numbers, self.values, self.nearby = {}, {}, [[]] * self.num
         for name, rule, stream in zip(column_names(header), header["rules"], streams, strict=True):
-            self._decode(name, rule, _Numbers(stream))
+            self._decode(name, rule, Numbers(stream))
             if name == "cell":
                 self.nearby = self._find_latest_of_cell()
             elif name == "y0":
@@ -227,7 +227,7 @@ class _Chunk:
                 total = 0.0
                 for j in self.nearby[i]:
                     total += values[j] / self._scale(power, j)
-                third = _signed_level((total / len(self.nearby[i]) * self._scale(power, i) - origin) / step)
+                third = signed_level((total / len(self.nearby[i]) * self._scale(power, i) - origin) / step)
             numbers[i] = stream.next(*self._contexts(name, power, h, i), third)
             if name == "cell":
                 numbers[i] = (numbers[i] + (numbers[i - 1] if i else 0)) % 2 ** sum(self.bits)

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from format_reader import Numbers, signed_level
 
 from foldgauss.video.compression import range_coder as coder
 
@@ -13,6 +14,7 @@ def columns():
     yield "one", np.array([-7])
     yield "zeros", np.zeros(5000)
     yield "extremes", np.array([largest, -largest, 0, 1, -1] * 40)
+    yield "dear", rng.integers(largest // 2, largest, 250) * rng.choice([-1, 1], 250)
     for scale in (0.3, 3, 300, 1e7):
         yield f"normal {scale}", np.clip(rng.normal(size=5000) * scale, -largest, largest)
     # Each number is what the ones before made unlikely: dearer than it is long.
@@ -26,6 +28,27 @@ def test_round_trip(name, values):
     for own in (plain, known(values, 0)):
         values = np.where(own.present, values, 0)
         np.testing.assert_array_equal(coder.decode(coder.encode(values, own), own), values)
+
+
+@pytest.mark.parametrize(("name", "values"), [pytest.param(*one, id=one[0]) for one in columns()])
+def test_a_reader_written_from_the_page_finds_the_same_numbers(name, values):
+    values = np.rint(values[:600]).astype(np.int32)
+    own = known(values, 1)
+    numbers, seen, found = Numbers(coder.encode(values, own)), np.zeros(len(values)), np.zeros_like(values)
+    for k in np.flatnonzero(own.present):
+        near = [seen[i] for i in own.near[k] if i >= 0]
+        predicted = signed_level((np.mean(near) * own.scale[k] - own.origin[k]) / own.step[k]) if near else 0
+        found[k] = numbers.next(*own.contexts[k], predicted)
+        seen[k] = (own.origin[k] + found[k] * own.step[k]) / own.scale[k]
+    numbers.end()
+    np.testing.assert_array_equal(found, np.where(own.present, values, 0))
+
+
+def test_numbers_that_are_too_large_are_damage():
+    data = coder.encode(np.array([2**coder.LARGEST_BITS]), coder.Column.without_contexts(1))
+    for stop in range(4, len(data) + 1):  # shorter ones are codes of other numbers
+        with pytest.raises(ValueError, match="damaged"):
+            coder.decode(data[:stop], coder.Column.without_contexts(1))
 
 
 def known(values, seed):

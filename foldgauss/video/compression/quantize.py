@@ -60,6 +60,8 @@ POWER_WORTH = 0.9
 _MAX_EXPONENT = 120
 #: The exponent of sqrt(2) of the finest step, which float32 tells apart at 1: finer ones would leave less range.
 FINEST_STEP = -48
+#: The half turn of angles begins here, in turns: below a quarter, which float32 may decode to a little less.
+_FIRST_ANGLE = 0.25 - 1e-6
 #: Largest steps; those of time and angle (turns) keep their logits finite.
 _MAX_STEP = {"time": 0.125, "angle": 0.125, "size": 0.35, "stretch": 0.5, "duration": 0.5, "opacity": 1.0}
 #: Frame times are rounded to a fraction of 2^-TIME_BITS of each interval,
@@ -455,7 +457,7 @@ def compute_columns(model: VideoModel) -> ExactColumns:
         "duration": leaf("log_time_scale"),
         "opacity": leaf("opacity_logit"),
         "time": _sigmoid(leaf("time_loc_logit")),
-        "angle": (turn + np.where(swapped, 0.0, -0.25)) % 0.5 + 0.25,
+        "angle": (turn + np.where(swapped, 0.25, 0.0) - _FIRST_ANGLE) % 0.5 + _FIRST_ANGLE,
     }
     values |= dict(zip(("luma", "blue", "green"), (leaf("color_dc") @ AXES.T).T, strict=True))
     polynomials = np.concatenate([leaf("loc")[:, None], leaf("coefficients")], 1)
@@ -624,7 +626,7 @@ def _round_columns(
         scaled = (values[name] - origin) / steps
         numbers = np.rint(scaled)
         if name == "angle":  # kept in its half turn, so that quantizing a decoded model changes nothing
-            low, high = (np.ceil((end - origin) / steps) for end in (0.25, 0.75))
+            low, high = (np.ceil((end - origin) / steps) for end in (_FIRST_ANGLE, _FIRST_ANGLE + 0.5))
             numbers = np.minimum(np.maximum(numbers, low), high - 1)
         require(
             np.isfinite(numbers).all(),

@@ -108,7 +108,7 @@ def _code_bit(data, interval, decodes, p, bit):
     while (interval[0] ^ interval[1]) & 0xFF000000 == 0:
         place = interval[3]
         if decodes:
-            interval[2] = ((interval[2] << 8) & 0xFFFFFFFF) | (_i(data[place]) if place < len(data) else 0)
+            interval[2] = ((interval[2] << 8) & 0xFFFFFFFF) | _i(data[place])
         else:
             data[place] = interval[1] >> 24
         interval[0] = (interval[0] << 8) & 0xFFFFFFFF
@@ -144,9 +144,9 @@ def _code_adaptive(data, interval, decodes, state, node, bit):
 def _code(values, present, contexts, origin, step, scale, near, state, data, interval, decodes, last_start):
     """Encode `values` into `data`, or, if `decodes`, decode `data` into `values`. Returns False on failure.
 
-    Encoding fails if the next value might not fit into the array; decoding fails for bytes that `encode` cannot have
-    written. `last_start` is the last offset in `data` at which coding a value may begin. Both directions take the same
-    steps: the decoder ignores the bits that are passed to `_code_adaptive`.
+    Decoding fails for bytes that `encode` cannot have written. `last_start` is the last offset in `data` at which
+    coding a value may begin; `MAX_CODE_BYTES` follow it. Both directions take the same steps: the decoder ignores the
+    bits that are passed to `_code_adaptive`.
     """
     seen, own = np.zeros(len(values)), state[0]
     for k in range(len(values)):
@@ -180,22 +180,21 @@ def _code(values, present, contexts, origin, step, scale, near, state, data, int
 
 def encode(values: Int32[np.ndarray, " num"], column: Column) -> bytes:
     """The bytes of a column; magnitudes below 2^30."""
-    values, num_bytes = np.array(values, np.int32), 4 * len(values) + 2 * MAX_CODE_BYTES
-    while True:
-        data, interval = np.empty(num_bytes, np.uint8), np.array([0, 0xFFFFFFFF, 0, 0])
-        if _code(values, *column, _initial_state(), data, interval, False, num_bytes - MAX_CODE_BYTES):
-            low, place = interval[0], interval[3]
-            # The shortest bytes that identify the interval: zeros are read after the end.
-            data[place] = (low >> 24) + (1 if low & 0xFFFFFF else 0)
-            return data[: place + 1].tobytes()
-        num_bytes *= 4  # its code is longer than four bytes per value
+    values, last_start = np.array(values, np.int32), MAX_CODE_BYTES * len(values)
+    data, interval = np.empty(last_start + MAX_CODE_BYTES, np.uint8), np.array([0, 0xFFFFFFFF, 0, 0])
+    _code(values, *column, _initial_state(), data, interval, False, last_start)
+    low, place = interval[0], interval[3]
+    # The shortest bytes that identify the interval: zeros are read after the end.
+    data[place] = (low >> 24) + (1 if low & 0xFFFFFF else 0)
+    return data[: place + 1].tobytes()
 
 
 def decode(data: bytes, column: Column) -> Int32[np.ndarray, " num"]:
     """The inverse of `encode`. Raises ValueError for bytes that it cannot have written."""
-    values, buffer = np.zeros(len(column.present), np.int32), np.frombuffer(bytearray(data), np.uint8)
+    padded = np.frombuffer(data + bytes(4 + MAX_CODE_BYTES), np.uint8).copy()
+    values = np.zeros(len(column.present), np.int32)
     interval = np.array([0, 0xFFFFFFFF, int.from_bytes(data[:4].ljust(4, b"\0"), "big"), 4])
-    fits = _code(values, *column, _initial_state(), buffer, interval, True, len(data) + 4)
+    fits = _code(values, *column, _initial_state(), padded, interval, True, len(data) + 4)
     if not fits or interval[3] != len(data) + 3:  # the encoder ends with one byte, the decoder reads four
         raise ValueError("a column of numbers is damaged")
     return values

@@ -1,13 +1,15 @@
-r"""Adam (Kingma and Ba 2015): its constants, its rule, and the implementations of it that fits use.
+r"""Quasi-hyperbolic Adam (Ma and Yarats 2019): its constants, its rule, and the implementations that fits use.
 
 With gradient $g$, moments $m, v$, learning rate $\eta$ and $n$ the number of steps taken:
 
 $$ m \gets \beta_1 m + (1 - \beta_1) g, \quad v \gets \beta_2 v + (1 - \beta_2) g^2, \quad
-   \theta \gets \theta - \eta\, \frac{m / (1 - \beta_1^n)}{\sqrt{v / (1 - \beta_2^n)} + \epsilon} $$
+   \theta \gets \theta - \eta\, \frac{\nu\, m / (1 - \beta_1^n) + (1 - \nu) g}
+   {\sqrt{v / (1 - \beta_2^n)} + \epsilon} $$
 
-`sparse_adam` (Numba) and its twin `masked_adam` (JAX) are for the rows of Gaussians, `update_paths` (JAX) for the maps
-of shared paths, and `FRAME_TIME_ADAM` (optax) for frame times; tests compare them with the rule in NumPy. Each row
-counts its own steps, so that its bias correction is right however seldom the Gaussian is alive.
+With $\nu = 1$ it is Adam (Kingma and Ba 2015). `sparse_adam` (Numba) and its twin `masked_adam` (JAX) are for the rows
+of Gaussians. Adam itself is used for the maps of shared paths (`update_paths`, JAX) and for frame times
+(`FRAME_TIME_ADAM`, optax). Tests compare them with the rule in NumPy. Each row counts its own steps, so that its bias
+correction is right however seldom the Gaussian is alive.
 """
 
 import math
@@ -69,7 +71,7 @@ def _turn(row, at, cos, sin):
 
 @kernel
 def _update(
-    start, stop, touched, rows, grad, first, second, counts, rounded, bits, rates, own_units, at, vectors, corrections
+    start, stop, touched, rows, grad, first, second, counts, rounded, bits, rates, nu, own_units, at, vectors, factors
 ):
     beta1, beta2 = _f(BETA1), _f(BETA2)
     own = rates.copy()
@@ -79,8 +81,8 @@ def _update(
     for k in range(start, stop):
         i = touched[k]
         counts[i] += 1
-        taken = min(counts[i], len(corrections) - 1)
-        correction1, correction2 = corrections[taken, 0], corrections[taken, 1]
+        taken = min(counts[i], len(factors) - 1)
+        correction1, correction2 = factors[taken, 0], factors[taken, 1]
         row, g, m, v = rows[i], grad[i], first[i], second[i]
         along, across, cos, sin, power, short = _f(1.0), _f(1.0), _f(1.0), _f(0.0), _f(1.0), _f(1.0)
         if own_units:
@@ -102,7 +104,8 @@ def _update(
         for c in range(width):
             m[c] = beta1 * m[c] + (_f(1.0) - beta1) * g[c]
             v[c] = beta2 * v[c] + (_f(1.0) - beta2) * g[c] * g[c]
-            g[c] = own[c] * m[c] * correction1 / (math.sqrt(v[c] * correction2) + _f(EPSILON))
+            g[c] = own[c] * (nu * m[c] * correction1 + (_f(1.0) - nu) * g[c])
+            g[c] /= math.sqrt(v[c] * correction2) + _f(EPSILON)
         _turn(g, vectors, cos, sin)
         for c in range(width):
             row[c] -= g[c]
@@ -121,14 +124,14 @@ def sparse_adam(
     rates: np.ndarray,
     *,
     rounded: np.ndarray,
+    nu: float = 1.0,
     own_units: bool,
 ) -> bool:
     """One step on the rows `touched`, in place; their gradients are set to zero. Returns whether they are finite.
 
     `rows`, `grad` and the moments `first`, `second`: float32 (num, width); `counts`: int32 (num,), steps taken by each
     row; `rates`: float32 (width,), learning rates by column. `rounded`, uint8 (num,): bits of the groups of leaves
-    (`row_layout.GROUPS`) whose gradients are ignored. `own_units`: rates are scaled by each Gaussian's axes and
-    duration, see `config.LearningRates`.
+    (`row_layout.GROUPS`) whose gradients are ignored. `nu` and `own_units`: see `config.LearningRates`.
     """
     degree = _find_degree(rows)
     names = ("log_scale", "angle_logit", "log_time_scale", "time_loc_logit")
@@ -140,7 +143,7 @@ def sparse_adam(
     def work(start: int) -> None:
         stop = min(start + _CHUNK, num)
         arrays = touched, rows, grad, first, second, counts, rounded, bits
-        sums[start // _CHUNK] = _update(start, stop, *arrays, rates, own_units, at, vectors, BIAS_CORRECTIONS)
+        sums[start // _CHUNK] = _update(start, stop, *arrays, rates, _f(nu), own_units, at, vectors, BIAS_CORRECTIONS)
 
     run_tasks(work, range(0, num, _CHUNK))
     return math.isfinite(sums.sum())
@@ -149,7 +152,7 @@ def sparse_adam(
 # ------------------------------------------------------------------------------------- rows of Gaussians, JAX
 
 
-def masked_adam(rows, grad, first, second, counts, touched, rates, *, rounded, own_units: bool):
+def masked_adam(rows, grad, first, second, counts, touched, rates, *, rounded, nu: float = 1.0, own_units: bool):
     """`sparse_adam` in JAX: rows, moments and counts after a step on the rows where `touched`, bool (num,), is true."""
     degree = _find_degree(rows)
     bits = np.zeros(rows.shape[1], np.uint8)
@@ -162,7 +165,7 @@ def masked_adam(rows, grad, first, second, counts, touched, rates, *, rounded, o
     grad = _turn_vectors(grad, degree, -angle)
     mean = beta1 * first + (one - beta1) * grad
     square = beta2 * second + (one - beta2) * grad * grad
-    change = rates[None, :] * factors * mean * corrections[:, :1]
+    change = rates[None, :] * factors * (np.float32(nu) * mean * corrections[:, :1] + np.float32(1 - nu) * grad)
     change /= jnp.sqrt(square * corrections[:, 1:]) + np.float32(EPSILON)
     moved, chosen = rows - _turn_vectors(change, degree, angle), touched[:, None]
     return jnp.where(chosen, moved, rows), jnp.where(chosen, mean, first), jnp.where(chosen, square, second), counts

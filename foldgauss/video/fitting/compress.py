@@ -8,7 +8,7 @@ import numpy as np
 
 from foldgauss._runtime.checks import require
 from foldgauss.video.compression.quantize import dequantize, envelope_of_all
-from foldgauss.video.fitting.config import DEFAULT_QUALITY, FitConfig, LearningRates, Strategy, Views, planned_steps
+from foldgauss.video.fitting.config import DEFAULT_QUALITY, FitConfig, Strategy, Views, planned_steps
 from foldgauss.video.fitting.loop import FitInfo, FitResult, check_frames, fit, start_from
 from foldgauss.video.fitting.rate import COMPRESSION_START, RateControl
 from foldgauss.video.fitting.state import FitState
@@ -61,7 +61,6 @@ def compress(
         compositing=model.compositing,
         options=model.options,
         strategy=Strategy(relocated_fraction=0.0, scale_cutoff=model.scale_cutoff),
-        rates=LearningRates(final=0.07),  # what is fitted already loses less by lower rates
         views=Views(interpolation_fraction=0.0),
     )
     if frames is None:

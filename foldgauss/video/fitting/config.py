@@ -89,6 +89,14 @@ class LearningRates:
     decayed: str = field(
         default="all", metadata=setting("Which learning rates decay: all, or that of positions", choices=("all", "loc"))
     )
+    nu: float = field(
+        default=0.7,
+        metadata=setting(
+            "Fraction of Adam's mean gradient in a step; the rest is the latest gradient",
+            "Quasi-hyperbolic Adam (Ma and Yarats 2019); 1 is Adam. Of the maps of paths and frame times it is 1.",
+            bounds="[0, 1]",
+        ),
+    )
     own_units: bool = field(
         default=True, metadata=setting("Learning rates are in units of each Gaussian's axes and duration")
     )
@@ -320,6 +328,7 @@ PUBLISHED_RATES = LearningRates(
     final=0.01,
     cooldown=0.0,
     decayed="loc",
+    nu=1.0,
     own_units=False,
 )
 #: Standard deviations, in its units, above which the published code renders a Gaussian.

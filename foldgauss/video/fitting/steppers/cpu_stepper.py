@@ -102,7 +102,7 @@ class CpuStepper:
         rates, time_rate, path_rate = learning_rates(config, progress, state.backoffs, passes)
         own_units = config.rates.own_units
         arrays = state.rows, self.grad, state.first, state.second, state.counts, touched
-        finite = sparse_adam(*arrays, rates, rounded=state.rounded, own_units=own_units)
+        finite = sparse_adam(*arrays, rates, rounded=state.rounded, nu=config.rates.nu, own_units=own_units)
         update_windows(state.rows, touched, self.window, spec)
         if config.learns_frame_times and num_frames > 2:
             moments = state.time_count, state.time_first, state.time_second

@@ -84,6 +84,7 @@ class Program:
     own_loss: Callable[[Array, Array], Array] | None  # of `register_loss`
     batch_size: int
     sparse_updates: bool
+    nu: float
     own_units: bool
     learns_times: bool
     grows: bool
@@ -152,9 +153,8 @@ def step(program: Program, arrays: DeviceArrays, frames: UInt8[Array, "frames he
     touched = seen.alive if program.sparse_updates else used
     moments, before = (arrays.first, arrays.second, arrays.counts), arrays.rows
     rates = jnp.pad(control.rates, (0, program.width - program.num_trained))
-    rows, first, second, counts = masked_adam(
-        arrays.rows, seen.by_rows, *moments, touched, rates, rounded=arrays.rounded, own_units=program.own_units
-    )
+    options = {"rounded": arrays.rounded, "nu": program.nu, "own_units": program.own_units}
+    rows, first, second, counts = masked_adam(arrays.rows, seen.by_rows, *moments, touched, rates, **options)
     logits, of_times = arrays.time_logits, (arrays.time_count, arrays.time_first, arrays.time_second)
     if program.learns_times:
         logits, of_times = update_frame_times(logits, of_times, seen.by_times, control.time_rate)

@@ -203,6 +203,7 @@ class JaxStepper:
             own_loss=LOSSES[config.loss.name],
             batch_size=config.views.batch_size,
             sparse_updates=config.strategy.sparse_updates,
+            nu=config.rates.nu,
             own_units=config.rates.own_units,
             learns_times=config.learns_frame_times and self.num_frames > 2,
             grows=config.strategy.growth is not None,
