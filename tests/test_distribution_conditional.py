@@ -246,6 +246,12 @@ def test_space_given_space_against_its_definition():
     np.testing.assert_allclose(space.mean, given.mean[:, :2], rtol=1e-12)
 
 
+def test_what_is_given_adds_its_own_error_to_that_of_every_point():
+    given = folded(2).condition(0, [0.1])
+    np.testing.assert_array_equal(given.error_estimate(np.zeros((5, 2))), np.full(5, given.time.error_estimate))
+    assert not given.has_rsample  # times are drawn by quantiles, which have no gradient
+
+
 @pytest.mark.slow  # it compiles for long
 @pytest.mark.parametrize(
     ("one", "other", "rest"),

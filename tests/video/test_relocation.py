@@ -223,5 +223,5 @@ def test_rates_cool_down():
     """As without a cooldown until it begins, continuous there, and almost 0 at the end."""
     warm, cool = (FitConfig(rates=LearningRates(final=0.25, cooldown=part)) for part in (0.0, 0.2))
     for progress, factor in [(0.0, 1), (0.5, 1), (0.7999, 1), (0.9, COLD + 0.5 * (1 - COLD)), (1.0, COLD)]:
-        got, whole = (learning_rates(config, progress, 0, 50.0)[0] for config in (cool, warm))
+        got, whole = (learning_rates(config, progress, 0)[0] for config in (cool, warm))
         np.testing.assert_allclose(got, factor * whole, rtol=1e-6 if factor == 1 else 1e-5)

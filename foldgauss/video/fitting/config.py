@@ -37,12 +37,6 @@ MIN_EVERY = 10
 MIN_RESET_EVERY = 200
 
 
-#: The default of `LearningRates.final` in fits of at most `FINAL_PASSES` passes.
-FINAL = 0.3
-#: With more passes over the frames, noise of the gradients adds up to more, and rates decay further.
-FINAL_PASSES = 100.0
-
-
 def _rate(leaf: str, default: float) -> Any:
     return field(default=default, metadata=setting(f"Of {leaf}", bounds="[0, inf)"))
 
@@ -70,13 +64,9 @@ class LearningRates:
     log_time_scale: float = _rate("log sigma_t", 0.07)
     frame_times: float = _rate("the times of the frames, which stay as they start if it is 0", 3e-3)
     paths: float = _rate("the maps of shared paths", 7e-4)
-    final: float | None = field(
-        default=None,
-        metadata=setting(
-            "Learning rates decay exponentially to this fraction of these values",
-            bounds="[0, 1]",
-            unset=f"{FINAL:g}; less in proportion in fits of more than {FINAL_PASSES:g} passes over the frames",
-        ),
+    final: float = field(
+        default=0.3,
+        metadata=setting("Learning rates decay exponentially to this fraction of these values", bounds="[0, 1]"),
     )
     cooldown: float = field(
         default=0.2,

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 
 from foldgauss._numerics.random_streams import Stream, make_generator
-from foldgauss.video.fitting.config import FINAL, FINAL_PASSES, FitConfig
+from foldgauss.video.fitting.config import FitConfig
 from foldgauss.video.models.row_layout import columns
 
 #: Frames whose errors tell how good the start is.
@@ -74,16 +74,13 @@ def choose_start_frames(num_frames: int) -> np.ndarray:
 # ------------------------------------------------------------------------------------------ learning rates
 
 
-def learning_rates(
-    config: FitConfig, progress: float, backoffs: int, passes: float
-) -> tuple[np.ndarray, np.float32, np.float32]:
-    """Adam's learning rates at a fraction of a plan that visits each frame `passes` times, and after back-offs.
+def learning_rates(config: FitConfig, progress: float, backoffs: int) -> tuple[np.ndarray, np.float32, np.float32]:
+    """Adam's learning rates at a fraction of a plan, and after back-offs.
 
     They are those of rows by column, float32 (width,), of frame times, and of the maps of shared paths.
     """
     rates, slower = config.rates, BACKOFF_FACTOR**-backoffs
-    final = FINAL / max(passes / FINAL_PASSES, 1.0) if rates.final is None else rates.final
-    decay = final**progress if final > 0 else 1 - progress
+    decay = rates.final**progress if rates.final > 0 else 1 - progress
     if 1 - progress < rates.cooldown:
         decay *= COLD + (1 - COLD) * ((1 - progress) / rates.cooldown)
     rows = np.empty(columns(config.fold_degree)["coefficients"].stop, np.float32)

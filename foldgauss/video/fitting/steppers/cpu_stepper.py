@@ -12,7 +12,6 @@ from foldgauss.video.fitting.config import FitConfig
 from foldgauss.video.fitting.losses import LOSSES
 from foldgauss.video.fitting.schedule import (
     choose_start_frames,
-    count_passes,
     learning_rates,
     steps_per_pass,
     to_planes,
@@ -98,8 +97,7 @@ class CpuStepper:
         if not config.strategy.sparse_updates:
             touched = np.arange(len(state.rows))
         scales = state.rows[::SIZE_STRIDE, columns(config.fold_degree)["log_scale"]].copy()  # before the step
-        passes = count_passes(config, num_frames, state.plan)
-        rates, time_rate, path_rate = learning_rates(config, progress, state.backoffs, passes)
+        rates, time_rate, path_rate = learning_rates(config, progress, state.backoffs)
         own_units = config.rates.own_units
         arrays = state.rows, self.grad, state.first, state.second, state.counts, touched
         finite = sparse_adam(*arrays, rates, rounded=state.rounded, nu=config.rates.nu, own_units=own_units)

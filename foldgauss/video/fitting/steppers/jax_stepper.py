@@ -14,7 +14,6 @@ from foldgauss.video.fitting.config import FitConfig, chosen_num_gaussians, most
 from foldgauss.video.fitting.losses import LOSSES
 from foldgauss.video.fitting.schedule import (
     choose_start_frames,
-    count_passes,
     find_views_in_turn,
     learning_rates,
     steps_per_pass,
@@ -118,8 +117,7 @@ class JaxStepper:
             state.fetch_all()
             self.adopt(state)
         held, config = state.held, self.config
-        passes = count_passes(config, self.num_frames, state.plan)
-        rates, time_rate, path_rate = learning_rates(config, progress, state.backoffs, passes)
+        rates, time_rate, path_rate = learning_rates(config, progress, state.backoffs)
         views, fractions = choose_targets(self.interpolation, config, self.num_frames, state, progress)
         control = Control(
             views=views.astype(np.int32),
