@@ -105,7 +105,7 @@ def test_gaussians_alive_in_no_frame_move_first():
     state.rows[between, at["time_loc_logit"].start] = 0  # t = 0.5 lies between two frames
     state.counts[between] = 0
     before = state.rows[between].copy()
-    relocate(state, FRAMES, CONFIG.replace(**{"strategy.relocated_fraction": 0.01}), SPEC, None)
+    relocate(state, FRAMES, CONFIG.replace(**{"strategy.relocated_fraction": 0.05}), SPEC, None)
     kept = {row.tobytes() for row in state.rows}
     assert not any(row.tobytes() in kept for row in before)
 

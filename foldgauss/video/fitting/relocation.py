@@ -37,6 +37,8 @@ from foldgauss.video.motion.optical_flow import Motion
 SMALLER = 0.6
 #: The fractions of the plan after which Gaussians are relocated.
 RELOCATED_AT = (0.2, 0.35, 0.5)
+#: Fewer are not relocated: where there are few Gaussians, estimates of what each adds are too noisy.
+_LEAST_RELOCATED = 10
 #: Gaussians with fewer steps than this are not judged yet.
 _MIN_COUNT = 5
 
@@ -80,7 +82,7 @@ def relocate(
     times = np.asarray(frame_times(state.time_logits))
     influence = measure_influence(state, find_windows(state.rows, spec), times, config.fold_degree)
     num = round(config.strategy.relocated_fraction * np.isfinite(influence).sum())
-    if num == 0:
+    if num < _LEAST_RELOCATED:
         return
     stay = np.ones(len(state.rows), bool)
     stay[np.argsort(influence, kind="stable")[:num]] = False
