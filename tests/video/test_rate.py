@@ -281,11 +281,11 @@ def test_a_psnr_within_reach_is_reached_by_a_file_that_is_hardly_larger_than_tha
 
 
 def test_a_psnr_is_that_over_any_background():
-    """If that over black alone counted, the model would end 10 dB below the whole one."""
+    """If that over black alone counted, the model would end 10 dB below the whole one (now 0.8 to 1.7)."""
     frames = silhouette()
     config = FitConfig(steps=400, num_gaussians=150)
     whole = over_white(fit(frames, config).model, frames)
-    assert over_white(fit(frames, dataclasses.replace(config, psnr=35.0)).model, frames) > whole - 3
+    assert over_white(fit(frames, dataclasses.replace(config, psnr=35.0)).model, frames) > whole - 2
 
 
 def test_a_fit_that_ends_before_its_first_action_is_rounded():
