@@ -285,7 +285,7 @@ def path_gaussians(num=5, dtype=np.float64, **changes) -> FoldedGaussian:
 
 
 def test_breaks_of_a_path_are_its_knots_and_those_of_its_own_fold():
-    """As u, seen from m_t; on no path those of any."""
+    """Breaks are values of u = m_t - t. Without a path, the knots of the first path count."""
     own = FOLDS["spline"]()
     for index, path in ((0, 0), (1, 0), (2, 1)):
         fold = SharedPathFold(own, [0.3, -1.0], time_loc=0.25, index=index, **PATHS)

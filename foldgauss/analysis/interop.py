@@ -29,7 +29,8 @@ def to_numpyro(dist: Any, *, validate_args: bool | None = None) -> "numpyro.dist
 
     `validate_args` warns of values out of the support; None is numpyro's own setting (`numpyro.enable_validation`).
     Parameters are checked where `dist` is constructed.
-    The methods `entropy`, `cdf`, `icdf` and `mode` call those of `dist`. They raise NotImplementedError if it has none.
+    The methods `entropy`, `cdf`, `icdf` and `mode` call those of `dist`.
+    If it has none, they raise NotImplementedError, by which numpyro's own distributions say so.
     `numpyro.distributions.kl_divergence` of two of them is `foldgauss.analysis.divergence.kl_divergence`.
 
     **Example:**

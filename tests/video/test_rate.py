@@ -25,7 +25,7 @@ from foldgauss.video.compression.quantizer import Worth, bit_price, round_groups
 from foldgauss.video.fitting.compress import ROUNDING_QUALITY
 from foldgauss.video.fitting.config import DEFAULT_QUALITY
 from foldgauss.video.fitting.loop import finish, start
-from foldgauss.video.fitting.rate import ACTIONS, HEADER_BYTES, RateControl, _bracket, count_bytes, count_past
+from foldgauss.video.fitting.rate import ACTIONS, HEADER_BYTES, RateControl, _bracket, _last, count_bytes, count_past
 from foldgauss.video.fitting.state import FitState, to_model
 from foldgauss.video.models.row_layout import COLOR, GROUPS, SHAPE, TRAJECTORY, columns, group_bits
 
@@ -278,6 +278,13 @@ def test_a_psnr_within_reach_is_reached_by_a_file_that_is_hardly_larger_than_tha
     made = fit(frames, dataclasses.replace(config, quality=None, psnr=wanted))
     assert evaluate(made.model, frames).mean_psnr >= wanted - TOLERATED_DB
     assert count_bytes(made.quantized) < 1.1 * count_bytes(given.quantized)
+
+
+def test_a_coarseness_is_searched_from_the_finest_one():
+    """Beyond values that do not serve, coarser ones may serve again: black frames are perfect without any Gaussian."""
+    assert _last(lambda coarseness: coarseness > 5, 0.0, 10.0) == 0
+    assert _last(lambda coarseness: coarseness < 5, 0.0, 10.0) == pytest.approx(5, abs=0.1)
+    assert _last(lambda coarseness: True, 0.0, 10.0) == 10
 
 
 def test_a_psnr_is_that_over_any_background():

@@ -98,6 +98,13 @@ def test_only_gaussians_that_can_be_judged_move():
     assert sum(row.tobytes() in kept for row in before) == 290
 
 
+def test_few_gaussians_are_not_relocated():
+    state = fitted_state()
+    before = state.rows.copy()
+    relocate(state, FRAMES, CONFIG.replace(**{"strategy.relocated_fraction": 0.01}), SPEC, None)
+    np.testing.assert_array_equal(state.rows, before)
+
+
 def test_gaussians_alive_in_no_frame_move_first():
     state, at = fitted_state(), columns(CONFIG.fold_degree)
     between = [3, 77, 150]
