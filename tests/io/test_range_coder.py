@@ -17,6 +17,8 @@ def columns():
     yield "dear", rng.integers(largest // 2, largest, 250) * rng.choice([-1, 1], 250)
     for scale in (0.3, 3, 300, 1e7):
         yield f"normal {scale}", np.clip(rng.normal(size=5000) * scale, -largest, largest)
+    # A weighted sum of logits is one below a multiple of 65536 here, which is rare.
+    yield "below", np.random.default_rng(1353).normal(size=40) * 3
     # So many ones among the bits that the interval still begins where it did after several bytes.
     yield "late", np.concatenate([np.zeros(20_000), np.tile([largest, 0, -1, -largest], 50)])
     # Each number is what the ones before made unlikely: dearer than it is long.
@@ -52,6 +54,13 @@ def test_a_reader_written_from_the_page_finds_the_same_numbers(name, values):
 def test_tables_of_logits_are_those_of_the_page():
     np.testing.assert_array_equal(coder.LOGISTIC, LOGISTIC)
     np.testing.assert_array_equal(coder.LOGIT, STRETCH)
+
+
+def test_nothing_beyond_the_table_of_probabilities_is_read(monkeypatch):
+    values, column = np.arange(1000) // 999, coder.Column.without_contexts(1000)  # the last one is not expected at all
+    data = coder.encode(values, column)
+    monkeypatch.setattr(coder, "LOGISTIC", np.append(coder.LOGISTIC, 0)[:-1])
+    assert coder.encode(values, column) == data
 
 
 def test_column_of_no_numbers_is_a_zero_byte():
