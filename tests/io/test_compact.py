@@ -2,9 +2,11 @@
 
 import dataclasses
 import json
+import os
 import re
 import zlib
 from operator import attrgetter
+from pathlib import Path
 
 import equinox as eqx
 import jax
@@ -15,12 +17,25 @@ from soft_models import NUM, SIZE, assert_same, crowd, of_degrees, on_paths, onl
 import foldgauss.video.compression.chunks as chunks_module
 from foldgauss.envelope import TimeLikelihood
 from foldgauss.io import ModelFileError, load_compact, load_video_model, save_compact
-from foldgauss.io.models.compact import MAGIC, VERSION, is_compact, pack_compact
+from foldgauss.io.models.compact import (
+    MAGIC,
+    VERSION,
+    _parse_cells,
+    is_compact,
+    leave_room,
+    load_compact_model,
+    measure_chunks,
+    pack_compact,
+)
 from foldgauss.io.models.video_model import read_metadata
 from foldgauss.render import RenderOptions
 from foldgauss.video import FitConfig, compress, layers
 from foldgauss.video.compression.chunks import LEAST, arrange, divide, divide_anew, find_layers, visible_spans
 from foldgauss.video.compression.quantize import (
+    LARGEST,
+    MAX_CELL_BITS,
+    MAX_CHUNKS,
+    MAX_PATH_BITS,
     MAX_TIME_BITS,
     TIME_BITS,
     Rule,
@@ -281,7 +296,10 @@ def test_wrong_paths_are_refused(tmp_path):
     quantized, path = fine(on_paths(soft_model())), tmp_path / "m.fgz"
     index, maps = np.full_like(quantized.columns["path"], 3), np.full_like(quantized.maps, 2**30)
     maps[:, 0] = 2**29  # each step is within the range
+    falling = fine(on_paths(soft_model(), at_frames=False))
+    falling.knots[1, 1] = falling.knots[1, 0] - 1
     files = {
+        "knots: .* got times that decrease": falling,
         "path: .* got numbers out of range": with_columns(quantized, path=index),
         "maps: .* got numbers out of range": dataclasses.replace(quantized, maps=maps),
         "bits": with_paths(quantized, bits=29),
@@ -293,6 +311,21 @@ def test_wrong_paths_are_refused(tmp_path):
         save_compact(path, wrong)
         with pytest.raises(ModelFileError, match=message):
             load_compact(path)
+    data = pack_compact(quantized)
+    for key, value in [
+        ("num_paths", 0),
+        ("num_paths", 256),
+        ("num_knots", 0),
+        ("num_knots", "7"),
+        ("at_frames", 1),
+        ("bits", -1),
+        ("bits", MAX_PATH_BITS + 1),
+        ("middle", "ab"),
+        ("middle", [0.0]),
+        ("sides", [0.0, 1.0]),
+    ]:
+        refused(tmp_path, resealed(data, lambda header: header["paths"].update({key: value})), f"{key}: expected")  # noqa: B023
+    refused(tmp_path, resealed(data, lambda header: header["paths"].update(num_knots=6)), "at_frames: expected")
 
 
 # ------------------------------------------------------------------------------------ fewer bits
@@ -396,7 +429,15 @@ def test_only_visible_chunks_are_read(tmp_path, chunked):
     spans = [own["visible"] for own in parts_of(data)[0]["chunks"]]
     assert spans[0] == [0, 1]
     assert spans[1][1] < spans[2][0]
-    for number, visible in ((1, (0.0, spans[1][1])), (1, (0.2, 0.2)), (2, (spans[2][0], 1.0)), (2, (0.7, 0.8))):
+    first, last = spans[2][0], spans[1][1]  # visible then, too
+    for number, visible in (
+        (1, (0.0, last)),
+        (1, (0.2, 0.2)),
+        (1, (last, last + 0.001)),
+        (2, (first, 1.0)),
+        (2, (0.7, 0.8)),
+        (2, (first - 0.001, first)),
+    ):
         other = 3 - number
         start, end = ends[other + 1 : other + 3]
         path.write_bytes(data[:start] + bytes(end - start) + data[end:])
@@ -436,6 +477,18 @@ def test_spans_hold_what_is_visible_at_times_that_coarse_steps_move(tmp_path, ti
     assert last >= min((at + reach).max(), 1) > last - 3e-4
 
 
+def test_visible_span_is_rounded_outward():
+    """To steps of 1e-4, with a margin for the rounding to float32."""
+    quantized = fine(only(soft_model(degree=0), np.arange(2)))
+    (chunk,), zeros = quantized.chunks, np.zeros(2, np.int32)
+    columns = chunk.columns | {"cell": zeros, "duration": zeros, "time": np.int32([0, 2])}
+    rules = quantized.rules | {"time": Rule(0.3, 0.0), "duration": Rule(-40.0, 0.0)}  # momentary, at 0.3 and 0.55
+    momentary = dataclasses.replace(
+        quantized, rules=rules, chunks=(dataclasses.replace(chunk, cells=(0, 0, 0), columns=columns),)
+    )
+    assert parts_of(pack_compact(momentary))[0]["chunks"][0]["visible"] == [0.2999, 0.5501]
+
+
 @pytest.mark.parametrize("visible", [(0.5, 0.2), (0.0, 1.5), (0.5,), 0.5, "ab", (np.nan, 1.0), None])
 def test_times_to_be_read_are_checked(tmp_path, good, visible):
     path = tmp_path / "m.fgz"
@@ -455,6 +508,7 @@ def test_a_file_cut_off_after_a_chunk_is_a_smaller_model(tmp_path, chunked):
         assert note.filename == __file__
         assert re.search(CUT_OFF, str(note.message)).groups() == (str(3 - num), str(134 * (3 - num)))
         assert_same(model, dequantize(dataclasses.replace(quantized, chunks=quantized.chunks[:num])))
+        assert measure_chunks(path) == (np.diff(ends[1:]).tolist(), len(data))
 
 
 def test_a_damaged_chunk_is_left_out(tmp_path, chunked):
@@ -465,6 +519,7 @@ def test_a_damaged_chunk_is_left_out(tmp_path, chunked):
         with pytest.warns(UserWarning, match=CUT_OFF) as caught:
             own = load_compact(path)
         assert [(note.filename, "134 of 402" in str(note.message)) for note in caught] == [(__file__, True)]
+        assert ("among them the largest" in str(caught[0].message)) == (number == 0)
         left = quantized.chunks[:number] + quantized.chunks[number + 1 :]
         assert_same(dequantize(own), dequantize(dataclasses.replace(quantized, chunks=left)))
 
@@ -473,7 +528,16 @@ def test_a_file_without_header_motion_or_any_chunk_is_rejected(tmp_path, chunked
     _, data = chunked
     ends = blocks_of(data)
     refused(tmp_path, flipped(data, 60), "the checksum of its header")
-    refused(tmp_path, flipped(data, ends[0]), "frame times are cut off or damaged")
+    refused(tmp_path, data[:19], "cut off after 19 bytes")
+    refused(tmp_path, data[:20], "the checksum of its header")
+    listed = json.dumps([parts_of(data)[0]]).encode()
+    numbers = (VERSION, len(listed), zlib.crc32(listed))
+    refused(tmp_path, MAGIC + np.array(numbers, "<u4").tobytes() + listed, "one whose header is not JSON of a model")
+    refused(
+        tmp_path,
+        flipped(data, ends[0]),
+        "^path: expected a compact model, got one whose frame times are cut off or damaged",
+    )
     refused(tmp_path, data[: ends[2] - 1], "3 of its 3 chunks are cut off or damaged; 402 of 402 Gaussians are missing")
     for start in ends[1:-1]:
         data = flipped(data, start + 3)
@@ -631,6 +695,14 @@ def changed(path, change, model=None):
     return eqx.tree_at(leaf, soft_model() if model is None else model, replace_fn=change)
 
 
+def spread(distance):
+    """A change of a path's arrays: those of the first knot become `-distance`, others `distance`."""
+    return lambda own: (
+        np.where(np.arange(own.shape[1]) > 0, distance, -distance).astype(np.float32).reshape(-1, *[1] * (own.ndim - 2))
+        + 0 * own
+    )
+
+
 #: What is made, and the error.
 REFUSED = {
     "a map out of range": (
@@ -643,6 +715,20 @@ REFUSED = {
     ),
     "late knots": (
         lambda: fine(changed("splats.paths.times", lambda own: own + np.float32(100), on_paths(soft_model()))),
+        "shared paths whose knots are within the range",
+    ),
+    "maps far apart": (
+        lambda: fine(changed("splats.paths.matrices", spread(200_000), on_paths(soft_model()))),
+        "paths whose maps are within the range",
+    ),
+    "maps far from the identity": (
+        lambda: fine(
+            changed("splats.paths.matrices", lambda own: 0 * own - np.float32(262_143), on_paths(soft_model()))
+        ),
+        "paths whose maps are within the range",
+    ),
+    "knots far apart": (
+        lambda: fine(changed("splats.paths.times", spread(60), on_paths(soft_model(), at_frames=False))),
         "shared paths whose knots are within the range",
     ),
     "another path": (
@@ -743,64 +829,72 @@ def test_changed_by_a_transfer_as_text(tmp_path, good):
 
 
 @pytest.mark.parametrize(
-    ("key", "value"),
+    ("key", "value", "message"),
     [
-        ("num_gaussians", 10**12),
-        ("num_gaussians", 0),
-        ("num_gaussians", 39),
-        ("num_gaussians", 3.5),
-        ("num_frames", 10**12),
-        ("num_frames", 0),
-        ("degree", 10**9),
-        ("degree", -1),
-        ("degree", 2),
-        ("size", [0, 5]),
-        ("size", [10**12, 5]),
-        ("size", "no"),
-        ("fps", -1),
-        ("power", 1e300),
-        ("floor", 1.0),
-        ("reach", 0),
-        ("compositing", "under"),
-        ("options", {"low_pass": -1}),
-        ("options", {"unknown": 1}),
-        ("rules", []),
-        ("rules", 5),
-        ("chunks", []),
-        ("chunks", 5),
-        ("chunks", [5]),
-        ("streams", []),
-        ("streams", 5),
-        ("streams", [10**30] * 24),
-        ("visible", [0.5]),
-        ("visible", ["a", "b"]),
-        ("visible", {"0": 0, "1": 1}),
-        ("visible", [0.6, 0.4]),
-        ("visible", [0, 1.5]),
-        ("visible", 5),
-        ("cells", [0, 0]),
-        ("cells", [0, 0, -1]),
-        ("cells", [30, 30, 30]),
-        ("cells", [2, 2, 2]),
-        ("cells", [5, 0, 0]),
-        ("cells", [0, 3, 0]),
-        ("cells", 5),
-        ("motion", 0),
-        ("motion", {"streams": [0, 0], "crc": 0}),
-        ("metadata", 5),
-        ("scale_cutoff", True),
-        ("time_bits", 25),
-        ("time_bits", -1),
-        ("time_bits", 10.5),
+        *(
+            (key, value, f"{key}: expected")
+            for key, value in [
+                ("num_gaussians", 10**12),
+                ("num_gaussians", 0),
+                ("num_gaussians", 3.5),
+                ("num_frames", 10**12),
+                ("num_frames", 0),
+                ("degree", -1),
+                ("degree", 10**9),
+                ("size", [0, 5]),
+                ("size", [10**12, 5]),
+                ("size", "no"),
+                ("fps", -1),
+                ("power", 1e300),
+                ("floor", 1.0),
+                ("reach", 0),
+                ("compositing", "under"),
+                ("rules", []),
+                ("rules", 5),
+                ("chunks", []),
+                ("chunks", 5),
+                ("chunks", [{}] * (MAX_CHUNKS + 1)),
+                ("streams", []),
+                ("streams", 5),
+                ("streams", [10**30] * 24),
+                ("visible", [0.5]),
+                ("visible", ["a", "b"]),
+                ("visible", {"0": 0, "1": 1}),
+                ("visible", [0.6, 0.4]),
+                ("visible", [0, 1.5]),
+                ("visible", 5),
+                ("cells", [0, 0]),
+                ("cells", [0, 0, -1]),
+                ("cells", [30, 30, 30]),
+                ("cells", [2, 2, 2]),
+                ("cells", [5, 0, 0]),
+                ("cells", [0, 3, 0]),
+                ("cells", 5),
+                ("scale_cutoff", True),
+                ("time_bits", 25),
+                ("time_bits", -1),
+                ("time_bits", 10.5),
+            ]
+        ),
+        ("num_gaussians", 39, "a column of numbers is damaged"),
+        ("cells", [0, 0, 5], "a column of numbers is damaged"),
+        ("cells", [2, 2, 0], "a column of numbers is damaged"),
+        ("degree", 2, "streams: expected"),
+        ("options", {"low_pass": -1}, "low_pass: expected"),
+        ("options", {"unknown": 1}, "unexpected keyword argument"),
+        ("chunks", [5], "one that does not fit together"),
+        ("motion", 0, "one that does not fit together"),
+        ("motion", {"streams": [0, 0], "crc": 0}, "streams: expected"),
+        ("metadata", 5, "one whose header is not JSON of a model"),
     ],
 )
-def test_forged_header_is_rejected(tmp_path, good, key, value):
+def test_forged_header_is_rejected(tmp_path, good, key, value, message):
     def change(header):
         where = header if key in header else header["chunks"][0]
         assert key in where
         where[key] = value
 
-    refused(tmp_path, resealed(good, change), "compact model")
+    refused(tmp_path, resealed(good, change), message)
 
 
 @pytest.mark.parametrize("cells", [[0, 0], [0, 0, -1], {"a": 0, "b": 0, "c": 0}])
@@ -826,7 +920,44 @@ def test_forged_degrees_are_rejected(tmp_path, number):
     quantized = fine(of_degrees(soft_model(degree=3)), -12.0)
     degree = quantized.columns["degree"].copy()
     degree[7] = number
-    refused(tmp_path, pack_compact(with_columns(quantized, degree=degree)), "compact model")
+    refused(tmp_path, pack_compact(with_columns(quantized, degree=degree)), "degree: .* got numbers out of range")
+
+
+def test_smallest_and_largest_constants_are_read(tmp_path, good):
+    quantized, path = fine(on_paths(soft_model()), -12.0), tmp_path / "m.fgz"
+    quantized.maps[0, :, 0, 2] = LARGEST
+    for size, time_bits, bits in (((1, 1), 0, 0), ((1 << 20, 5), MAX_TIME_BITS, MAX_PATH_BITS)):
+        own = with_paths(quantized, bits=bits)
+        own = dataclasses.replace(own, info=dataclasses.replace(own.info, size=size, time_bits=time_bits))
+        again = load_compact(save_compact(path, own))
+        assert again.info == own.info
+        np.testing.assert_array_equal(again.maps, own.maps)
+    path.write_bytes(resealed(good, lambda header: header["chunks"][0].update(visible=[0.5, 0.5])))
+    assert load_compact(path).num_gaussians == NUM
+    assert _parse_cells([8, 8, 8], 1 << MAX_CELL_BITS) == (8, 8, 8)
+
+
+def test_values_beyond_float32_are_rejected(tmp_path):
+    """Even those of a single Gaussian."""
+    quantized = fine(soft_model(degree=3))
+    own = with_columns(quantized, x3=np.eye(1, NUM, dtype=np.int32)[0], degree=np.full(NUM, 3, np.int32))
+    rules = own.rules | {"duration": Rule(-40.0, 0.0), "x3": Rule(0.0, 60.0)}
+    refused(tmp_path, pack_compact(dataclasses.replace(own, rules=rules)), "one with values beyond float32")
+
+
+def test_rules_have_the_numbers_that_they_may_have(tmp_path, good):
+    """Origin, exponent, and at most as many slopes as there are columns of features before."""
+    names, path = column_names(3), tmp_path / "m.fgz"
+
+    def with_more(name, more):
+        return resealed(good, lambda header: header["rules"][names.index(name)].extend(more))
+
+    for name, slopes in (("size", 1), ("stretch", 2), ("green", 5)):
+        path.write_bytes(with_more(name, [0.0] * slopes))
+        assert load_compact(path).rules[name].slopes == (0.0,) * slopes
+        refused(tmp_path, with_more(name, [0.0] * (slopes + 1)), f"rule: expected .* got {name}")
+    refused(tmp_path, with_more("green", [2e9]), "rule: expected .* got green")
+    refused(tmp_path, with_more("class", [0.0, 0.0]), "rules: expected .* got some of columns of integers")
 
 
 def test_file_has_a_byte_for_every_32_numbers(tmp_path):
@@ -849,6 +980,51 @@ def test_file_has_a_byte_for_every_32_numbers(tmp_path):
     refused(tmp_path, resealed(data, spaces=spaces - 1), "num_gaussians: expected .* got 10000")
 
 
+@pytest.mark.parametrize(
+    ("num_frames", "num_paths", "num_knots"),
+    [(64_000, 0, 0), (5001, 2, 5001), (7, 255, 40), (7, 1, 9001), (7, 3, 1)],
+)
+def test_motion_has_a_byte_for_every_32_numbers(tmp_path, num_frames, num_paths, num_knots):
+    """Frame times, the six numbers of each map, and its time unless that is a frame's."""
+    own, path = fine(on_paths(soft_model()) if num_paths else soft_model(), -12.0), tmp_path / "m.fgz"
+    own = dataclasses.replace(own, intervals=np.zeros(num_frames - 1, np.int32))
+    if num_paths:
+        at_frames = num_knots == num_frames
+        own = with_paths(own, num_paths=num_paths, num_knots=num_knots, at_frames=at_frames)
+        own = with_columns(own, path=np.minimum(own.columns["path"], num_paths))
+        maps = np.tile(np.eye(2, 3, dtype=np.int32) << own.info.paths.bits, (num_paths, num_knots, 1, 1))
+        own = dataclasses.replace(own, maps=maps, knots=None if at_frames else np.zeros(maps.shape[:2], np.int32))
+    data = path.write_bytes(pack_compact(own)) and path.read_bytes()
+    assert pack_compact(load_compact(path)) == data
+    header, body = parts_of(data)
+    needed = -(-(num_frames + num_paths * num_knots * (6 if num_knots == num_frames else 7)) // 32)
+    spaces = needed - sum(header["motion"]["streams"]) - len(json.dumps(header))
+    assert len(data) - len(body) - len(MAGIC) - 12 == len(json.dumps(header)) + max(spaces, 0)
+    if spaces > 0:
+        path.write_bytes(resealed(data, spaces=spaces))
+        assert pack_compact(load_compact(path)) == data
+        refused(tmp_path, resealed(data, spaces=spaces - 1), "num_frames: expected")
+
+
+def test_long_metadata_leave_less_room():
+    """A thousand bytes of them are planned for."""
+    for size, excess, left in (
+        (2, -500, 2),
+        (1e-9, 0, 1e-9),
+        (2, 1, 2 - 1e-6),
+        (2, 500_000, 1.5),
+        (2, 3_000_000, 1e-6),
+    ):
+        about = {"clip": "x" * (1000 + excess - len(json.dumps({"clip": ""})))}
+        assert leave_room(size, about) == pytest.approx(left, rel=1e-12)
+        assert leave_room(None, about) is None
+
+
+def test_bytes_of_a_part_of_a_file_are_a_model(tmp_path, good):
+    (tmp_path / "m.fgz").write_bytes(good)
+    assert_same(load_compact_model(Path("whole.file"), good), load_video_model(tmp_path / "m.fgz"))
+
+
 def test_names(tmp_path):
     path = save_compact(tmp_path / "m.fgz", fine(soft_model()))
     plain = path.rename(tmp_path / "other.name")  # told by its bytes
@@ -860,3 +1036,16 @@ def test_names(tmp_path):
 def test_a_file_that_cannot_be_read_is_not_compact(tmp_path):
     assert not is_compact(tmp_path / "missing.fgz")
     assert not is_compact(tmp_path)
+    assert not is_compact("/proc/self/mem")  # where there is one, its first bytes cannot be read
+    (tmp_path / "other.fgz").write_bytes(b"something else")
+    with pytest.raises(ModelFileError, match="a file of another kind"):
+        load_compact(tmp_path / "other.fgz")
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="this system has no named pipes")
+def test_a_pipe_is_not_compact(tmp_path):
+    """Whatever it holds: reading would take it out."""
+    os.mkfifo(tmp_path / "pipe.fgz")
+    with open(os.open(tmp_path / "pipe.fgz", os.O_RDWR), "r+b", buffering=0) as pipe:
+        pipe.write(MAGIC)
+        assert not is_compact(tmp_path / "pipe.fgz")

@@ -33,6 +33,19 @@ def test_cuts_of_frames():
     assert isinstance(cuts, np.ndarray)  # JAX would round float64
 
 
+def test_gap_is_8_frames_and_3_times_the_longer_shot():
+    shots = np.array([6, 3, 11])
+    intervals = np.exp(make_time_logits(20, [6, 9]))
+    np.testing.assert_allclose(intervals[[5, 8]], 8 + 3 * np.maximum(shots[:-1], shots[1:]), rtol=1e-6)
+    np.testing.assert_array_equal(np.delete(intervals, [5, 8]), 1)
+
+
+@pytest.mark.parametrize("arrays", [np, jnp])
+def test_cut_is_an_interval_longer_than_6_median_ones(arrays):
+    times = arrays.asarray(np.cumsum([0, 1, 6, 7, 1, 1]), np.float32)
+    np.testing.assert_array_equal(is_cut(times), [False, False, True, False, False])
+
+
 def test_a_single_frame_covers_all_times():
     one, some = FrameTimes.uniform(1), jnp.asarray([0.0, 0.3, 1.0])
     assert one.num_frames == 1
@@ -85,8 +98,25 @@ def test_times_snap_to_shots_at_a_cut():
     np.testing.assert_array_equal(held[[0, 1, 2, 5]], t[[0, 1, 2, 5]].astype(np.float32))
 
 
+def test_times_snap_at_the_first_and_the_last_interval_too():
+    """The middle of a gap belongs to the later shot."""
+    times = np.float32([0, 0.4375, 0.46875, 0.5, 0.53125, 0.5625, 1])
+    np.testing.assert_array_equal(np.flatnonzero(is_cut(times)), [0, 5])
+    t = np.arange(65, dtype=np.float32) / 64
+    snapped = np.where(t < 0.21875, 0, np.where(t < 0.4375, 0.4375, np.where(t > 0.5625, 0.5625, t)))
+    np.testing.assert_array_equal(snap_to_shots(t, times), np.where(t >= 0.78125, 1, snapped))
+
+
 TWO = np.array([0.0, 1.0])
-POINTS = [[[0, 0]], [[0, 0], [0, 1]], [[1, 0], [2, 1]], [[0, 0], [1, -1]], [[0, 0], [1, np.nan]], [0, 1]]
+POINTS = [
+    [[0, 0]],
+    [[0, 0], [0, 1]],
+    [[1, 0], [2, 1]],
+    [[0, 0], [1, -1]],
+    [[0, 0], [1, np.nan]],
+    [0, 1],
+    [[0, 0], [2, 1], [1, 2]],
+]
 WRONG = [
     (lambda: FrameTimes.uniform(0), "num_frames"),
     *((lambda own=own: interpolated_times(TWO, own), "upsample: expected a whole number") for own in (0, 2.5, "2")),

@@ -688,19 +688,22 @@ def describe_paths(model: VideoModel) -> PathsInfo:
 
 
 def round_paths(about: PathsInfo, paths: SharedPaths) -> dict[str, Int32[np.ndarray, "..."]]:
-    """The integers of the maps and, unless they are at the frames, of their times; magnitudes up to `LARGEST`."""
-    scaled = {"maps": np.asarray(paths.matrices, np.float64) * 2.0**about.bits}
-    if not about.at_frames:
-        scaled["knots"] = np.asarray(paths.times, np.float64) / KNOT_STEP
-    for name, numbers in scaled.items():
+    """The integers of the maps and, unless they are at the frames, of their times.
+
+    They and their differences, which the file has, have magnitudes up to `LARGEST`.
+    """
+    rounded = {"maps": np.rint(np.asarray(paths.matrices, np.float64) * 2.0**about.bits)}
+    rounded |= {} if about.at_frames else {"knots": np.rint(np.asarray(paths.times, np.float64) / KNOT_STEP)}
+    for name, numbers in rounded.items():
+        first = np.eye(2, 3) * 2.0**about.bits if name == "maps" else 0.0
         require(
-            (np.abs(numbers) <= LARGEST).all(),
+            all((np.abs(own) <= LARGEST).all() for own in (numbers, np.diff(numbers - first, axis=1, prepend=0))),
             "model",
             expected=f"shared paths whose {name} are within the range of their steps",
             got="others",
             cure="Save it as .safetensors.",
         )
-    return {name: np.rint(numbers).astype(np.int32) for name, numbers in scaled.items()}
+    return {name: numbers.astype(np.int32) for name, numbers in rounded.items()}
 
 
 def decode_paths(

@@ -124,7 +124,7 @@ def sparse_adam(
     rates: np.ndarray,
     *,
     rounded: np.ndarray,
-    nu: float = 1.0,
+    nu: float,
     own_units: bool,
 ) -> bool:
     """One step on the rows `touched`, in place; their gradients are set to zero. Returns whether they are finite.
@@ -152,7 +152,7 @@ def sparse_adam(
 # ------------------------------------------------------------------------------------- rows of Gaussians, JAX
 
 
-def masked_adam(rows, grad, first, second, counts, touched, rates, *, rounded, nu: float = 1.0, own_units: bool):
+def masked_adam(rows, grad, first, second, counts, touched, rates, *, rounded, nu: float, own_units: bool):
     """`sparse_adam` in JAX: rows, moments and counts after a step on the rows where `touched`, bool (num,), is true."""
     degree = _find_degree(rows)
     bits = np.zeros(rows.shape[1], np.uint8)
