@@ -6,18 +6,24 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from path_models import moving_splats, random_splats
+from path_models import moving_splats, random_paths, random_splats
 
-from foldgauss.render import RenderOptions
+from foldgauss._runtime.threads import run_tasks
+from foldgauss.envelope import TimeLikelihood
+from foldgauss.render import RenderOptions, pixels_per_unit
 from foldgauss.video import FrameTimes, VideoModel
+from foldgauss.video.models import conditioning
 from foldgauss.video.models.conditioning import (
     ConditioningSpec,
+    PreparedModel,
     backpropagate,
     condition,
     find_windows,
+    mirror,
 )
 from foldgauss.video.models.row_layout import columns, pack, unpack
 from foldgauss.video.models.shared_paths import SharedPaths
+from foldgauss.video.models.splats import TAU_MAX
 
 SIZE, T = (48, 80), np.float32(0.4)
 
@@ -116,6 +122,113 @@ def test_scale_cutoff_keeps_the_times_when_both_scales_exceed_it(power, floor, c
     kept = (cut[:, :1] < t) & (t < cut[:, 1:])
     np.testing.assert_array_equal(kept, smaller > cutoff)
     assert 0.2 < kept.mean() < 0.8
+
+
+def test_a_scale_that_equals_the_cutoff_is_left_out():
+    """With power 0 the scale is the same at all times."""
+    rows, spec = np.zeros((1, 11), np.float32), ConditioningSpec(0, 0.0, 0.0, SIZE, scale_cutoff=1.0)
+    np.testing.assert_array_equal(find_windows(rows, spec), [[0.5, 0.5]])
+    longest = find_windows(rows, dataclasses.replace(spec, scale_cutoff=0.999))
+    np.testing.assert_allclose(longest, [[0.5 - TAU_MAX, 0.5 + TAU_MAX]], rtol=1e-6)
+
+
+def test_windows_are_open_intervals():
+    """A Gaussian is not alive at the ends of its window, and only `members` are alive."""
+    rows, spec, _ = twin(random_splats(num=4), 2.0, 0.0)
+    window = np.float32([[T, 1], [0, T], [0, 1], [0, 1]])
+    np.testing.assert_array_equal(condition(rows, window, T, spec).alive, [2, 3])
+    np.testing.assert_array_equal(condition(rows, window, T, spec, np.array([True, True, True, False])).alive, [2])
+
+
+def random_gradients(done):
+    rng = np.random.default_rng(2)
+    return [rng.normal(size=of.shape).astype(np.float32) for of in (done.mean, done.factor, done.opacity, done.color)]
+
+
+def test_results_do_not_depend_on_the_tasks(monkeypatch):
+    """Tasks of 24 Gaussians, from the last to the first, give the windows, splats and gradients of a single task."""
+    results = []
+    for chunk, run in ((4096, run_tasks), (24, lambda task, starts: [task(start) for start in reversed(starts)])):
+        monkeypatch.setattr(conditioning, "CHUNK", chunk)
+        monkeypatch.setattr(conditioning, "run_tasks", run)
+        rows, spec, done = twin(moving_splats(), 2.0, 0.0)
+        grad, path_grad = np.zeros_like(rows), np.zeros((2, 2, 3))
+        sums = backpropagate(rows, done, random_gradients(done), spec, grad, path_grad), path_grad
+        splats = [getattr(done, name) for name in ("alive", "mean", "factor", "opacity", "color", "kept")]
+        results.append(([find_windows(rows, spec), grad, *splats], sums))
+    (one, sums), (other, other_sums) = results
+    jax.tree.map(np.testing.assert_array_equal, one, other)
+    for total, same in zip(sums, other_sums, strict=True):
+        np.testing.assert_allclose(total, same, rtol=1e-5, atol=1e-6 * np.abs(total).max())
+
+
+def test_shared_paths_and_their_gradient_are_optional():
+    """Rows without a column of paths are not moved; without `path_grad` the rows have the same gradient."""
+    rows, spec, done = twin(random_splats(), 2.0, 0.0)
+    resting = condition(rows, find_windows(rows, spec), T, dataclasses.replace(spec, paths=random_paths()))
+    np.testing.assert_array_equal(resting.mean, done.mean)
+    untouched = np.zeros((2, 2, 3))
+    backpropagate(rows, resting, random_gradients(done), spec, np.zeros_like(rows), untouched)
+    assert not untouched.any()
+    rows, spec, done = twin(moving_splats(), 2.0, 0.0)
+    grads = np.zeros((2, *rows.shape), np.float32)
+    for grad, path_grad in zip(grads, (np.zeros((2, 2, 3)), None), strict=True):
+        backpropagate(rows, done, random_gradients(done), spec, grad, path_grad)
+    np.testing.assert_array_equal(*grads)
+
+
+def test_scales_far_from_their_time_are_accurate():
+    """Down to exp(-70), where the envelope is no normal float32; the gradient is finite."""
+    rows, spec = np.zeros((1, 11), np.float32), ConditioningSpec(0, 280 / 9, 0.0, SIZE)
+    done = condition(rows, find_windows(rows, spec), 3.5, spec)  # 3 standard deviations from 0.5
+    scales = np.sqrt(np.sum(np.float64(done.factor) ** 2, axis=1))
+    np.testing.assert_allclose(scales, np.full((1, 2), pixels_per_unit(SIZE) * np.exp(-70)), rtol=1e-4)
+    grad = np.zeros_like(rows)
+    d_time = backpropagate(rows, done, random_gradients(done), spec, grad)
+    assert np.isfinite([d_time, *grad[0]]).all()
+
+
+def test_mirror_reverses_x():
+    mean, factor = np.float32([[3, 5], [50, -1]]), np.arange(8, dtype=np.float32).reshape(2, 2, 2)
+    for width, expected in ((40, [[37, 5], [-10, -1]]), (0, [[-3, 5], [-50, -1]])):
+        moved, turned = mirror(mean, factor, width)
+        np.testing.assert_array_equal(moved, expected)
+        np.testing.assert_array_equal(turned, [[[0, -1], [2, 3]], [[-4, -5], [6, 7]]])
+
+
+def test_prepared_models_are_conditioned_by_the_models_own_settings():
+    """The envelope, the cutoff of scales, and the aspect of the model's frame unless another is given."""
+    size, splats = (48, 200), random_splats(floor=0.02)
+    model = VideoModel(splats, FrameTimes.uniform(2), SIZE, 25.0, RenderOptions(), scale_cutoff=0.02)
+    rows, spec, _ = twin(splats, 2.0, np.float32(0.02))
+    for own, aspect in (({}, 0.6), ({"aspect": 1.5}, 1.5)):
+        shape = dataclasses.replace(spec, size=size, aspect=aspect, scale_cutoff=0.02)
+        done, prepared = condition(rows, find_windows(rows, shape), T, shape), PreparedModel(model, size, **own)
+        assert 0 < len(done.alive) < len(rows)
+        found = prepared.splats(T)
+        for name in ("mean", "factor", "opacity", "color"):
+            np.testing.assert_array_equal(getattr(found, name), getattr(done, name), err_msg=name)
+        np.testing.assert_array_equal(prepared.at(T, np.arange(len(rows)) < 100).alive, done.alive[done.alive < 100])
+        for value, field in ((prepared.spec, "size"), (done, "mean")):
+            with pytest.raises(dataclasses.FrozenInstanceError):
+                setattr(value, field, None)
+
+
+BROKEN = np.where(np.isin(np.arange(300), [3, 5, 7])[:, None], [np.nan, 0], 0).astype(np.float32)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"loc": BROKEN}, "^model: .* others in 3 Gaussians"),
+        ({"envelope": TimeLikelihood(np.float32(np.arange(300) % 2))}, r"envelope.power: .* 2 different ones"),
+    ],
+)
+def test_models_that_cannot_be_prepared_raise(change, message):
+    splats = random_splats()
+    model = VideoModel(dataclasses.replace(splats, **change), FrameTimes.uniform(2), SIZE, 25.0, RenderOptions())
+    with pytest.raises(ValueError, match=message):
+        PreparedModel(model, SIZE)
 
 
 @pytest.mark.parametrize("degree", [0, 3])
