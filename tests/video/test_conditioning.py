@@ -10,7 +10,7 @@ from path_models import moving_splats, random_paths, random_splats
 
 from foldgauss._runtime.threads import run_tasks
 from foldgauss.envelope import TimeLikelihood
-from foldgauss.render import RenderOptions, pixels_per_unit
+from foldgauss.render import RenderOptions, Splats2D, pixels_per_unit
 from foldgauss.video import FrameTimes, VideoModel
 from foldgauss.video.models import conditioning
 from foldgauss.video.models.conditioning import (
@@ -125,19 +125,18 @@ def test_scale_cutoff_keeps_the_times_when_both_scales_exceed_it(power, floor, c
 
 
 def test_a_scale_that_equals_the_cutoff_is_left_out():
-    """With power 0 the scale is the same at all times."""
-    rows, spec = np.zeros((1, 11), np.float32), ConditioningSpec(0, 0.0, 0.0, SIZE, scale_cutoff=1.0)
-    np.testing.assert_array_equal(find_windows(rows, spec), [[0.5, 0.5]])
-    longest = find_windows(rows, dataclasses.replace(spec, scale_cutoff=0.999))
-    np.testing.assert_allclose(longest, [[0.5 - TAU_MAX, 0.5 + TAU_MAX]], rtol=1e-6)
+    """With power 0 the scale is the same at all times; else it is exp(-power tau^2 / 4) times that of the center."""
+    rows, spec = np.zeros((1, 11), np.float32), ConditioningSpec(0, 0.0, 0.0, SIZE)
+    for power, cutoff, reach in ((0, 1.0, 0), (0, 0.999, TAU_MAX), (1e3, 1e-200, np.sqrt(800 * np.log(10) / 1e3))):
+        window = find_windows(rows, dataclasses.replace(spec, power=float(power), scale_cutoff=cutoff))
+        np.testing.assert_allclose(window, [[0.5 - reach, 0.5 + reach]], rtol=1e-6)
 
 
-def test_windows_are_open_intervals():
-    """A Gaussian is not alive at the ends of its window, and only `members` are alive."""
-    rows, spec, _ = twin(random_splats(num=4), 2.0, 0.0)
-    window = np.float32([[T, 1], [0, T], [0, 1], [0, 1]])
+def test_windows_are_open_intervals_and_only_members_are_alive():
+    rows, spec, _ = twin(random_splats(), 2.0, 0.0)
+    window, members = np.float32([[T, 1], [0, T], [0, 1], [0, 1]]), np.array([True, True, True, False])
     np.testing.assert_array_equal(condition(rows, window, T, spec).alive, [2, 3])
-    np.testing.assert_array_equal(condition(rows, window, T, spec, np.array([True, True, True, False])).alive, [2])
+    np.testing.assert_array_equal(condition(rows, window, T, spec, members).alive, [2])
 
 
 def random_gradients(done):
@@ -153,65 +152,51 @@ def test_results_do_not_depend_on_the_tasks(monkeypatch):
         monkeypatch.setattr(conditioning, "run_tasks", run)
         rows, spec, done = twin(moving_splats(), 2.0, 0.0)
         grad, path_grad = np.zeros_like(rows), np.zeros((2, 2, 3))
-        sums = backpropagate(rows, done, random_gradients(done), spec, grad, path_grad), path_grad
+        d_time = backpropagate(rows, done, random_gradients(done), spec, grad, path_grad)
         splats = [getattr(done, name) for name in ("alive", "mean", "factor", "opacity", "color", "kept")]
-        results.append(([find_windows(rows, spec), grad, *splats], sums))
-    (one, sums), (other, other_sums) = results
-    jax.tree.map(np.testing.assert_array_equal, one, other)
-    for total, same in zip(sums, other_sums, strict=True):
-        np.testing.assert_allclose(total, same, rtol=1e-5, atol=1e-6 * np.abs(total).max())
+        results.append([find_windows(rows, spec), grad, *splats, path_grad, d_time])
+    for one, other in zip(*results, strict=True):
+        np.testing.assert_allclose(one, other, rtol=1e-5, atol=1e-7 * np.abs(one).max())
 
 
-def test_shared_paths_and_their_gradient_are_optional():
-    """Rows without a column of paths are not moved; without `path_grad` the rows have the same gradient."""
+def test_rows_without_a_column_of_paths_are_not_moved():
     rows, spec, done = twin(random_splats(), 2.0, 0.0)
     resting = condition(rows, find_windows(rows, spec), T, dataclasses.replace(spec, paths=random_paths()))
     np.testing.assert_array_equal(resting.mean, done.mean)
-    untouched = np.zeros((2, 2, 3))
-    backpropagate(rows, resting, random_gradients(done), spec, np.zeros_like(rows), untouched)
-    assert not untouched.any()
-    rows, spec, done = twin(moving_splats(), 2.0, 0.0)
-    grads = np.zeros((2, *rows.shape), np.float32)
-    for grad, path_grad in zip(grads, (np.zeros((2, 2, 3)), None), strict=True):
-        backpropagate(rows, done, random_gradients(done), spec, grad, path_grad)
-    np.testing.assert_array_equal(*grads)
+    path_grad = np.zeros((2, 2, 3))
+    backpropagate(rows, resting, random_gradients(done), spec, np.zeros_like(rows), path_grad)
+    np.testing.assert_array_equal(path_grad, 0)
 
 
 def test_scales_far_from_their_time_are_accurate():
-    """Down to exp(-70), where the envelope is no normal float32; the gradient is finite."""
+    # Down to exp(-70), where the envelope is no normal float32; the gradient is finite.
     rows, spec = np.zeros((1, 11), np.float32), ConditioningSpec(0, 280 / 9, 0.0, SIZE)
-    done = condition(rows, find_windows(rows, spec), 3.5, spec)  # 3 standard deviations from 0.5
-    scales = np.sqrt(np.sum(np.float64(done.factor) ** 2, axis=1))
-    np.testing.assert_allclose(scales, np.full((1, 2), pixels_per_unit(SIZE) * np.exp(-70)), rtol=1e-4)
-    grad = np.zeros_like(rows)
-    d_time = backpropagate(rows, done, random_gradients(done), spec, grad)
-    assert np.isfinite([d_time, *grad[0]]).all()
+    done, grad = condition(rows, find_windows(rows, spec), 3.5, spec), np.zeros_like(rows)  # at tau = -3
+    scale = pixels_per_unit(SIZE) * np.exp(-70)
+    np.testing.assert_allclose(np.sqrt(np.sum(np.float64(done.factor) ** 2, axis=1)), [[scale, scale]], rtol=1e-4)
+    assert np.isfinite([backpropagate(rows, done, random_gradients(done), spec, grad), *grad[0]]).all()
 
 
 def test_mirror_reverses_x():
     mean, factor = np.float32([[3, 5], [50, -1]]), np.arange(8, dtype=np.float32).reshape(2, 2, 2)
-    for width, expected in ((40, [[37, 5], [-10, -1]]), (0, [[-3, 5], [-50, -1]])):
-        moved, turned = mirror(mean, factor, width)
-        np.testing.assert_array_equal(moved, expected)
-        np.testing.assert_array_equal(turned, [[[0, -1], [2, 3]], [[-4, -5], [6, 7]]])
+    expected = [[37, 5], [-10, -1]], [[[0, -1], [2, 3]], [[-4, -5], [6, 7]]]
+    for found, truth in zip(mirror(mean, factor, 40), expected, strict=True):
+        np.testing.assert_array_equal(found, truth)
 
 
-def test_prepared_models_are_conditioned_by_the_models_own_settings():
-    """The envelope, the cutoff of scales, and the aspect of the model's frame unless another is given."""
-    size, splats = (48, 200), random_splats(floor=0.02)
+@pytest.mark.parametrize(("own", "aspect"), [({}, 0.6), ({"aspect": 1.5}, 1.5)])
+def test_prepared_models_have_the_models_settings(own, aspect):
+    # The envelope, the cutoff of scales, and the aspect of the model's frame unless another is given.
+    splats = random_splats(floor=0.02)
     model = VideoModel(splats, FrameTimes.uniform(2), SIZE, 25.0, RenderOptions(), scale_cutoff=0.02)
-    rows, spec, _ = twin(splats, 2.0, np.float32(0.02))
-    for own, aspect in (({}, 0.6), ({"aspect": 1.5}, 1.5)):
-        shape = dataclasses.replace(spec, size=size, aspect=aspect, scale_cutoff=0.02)
-        done, prepared = condition(rows, find_windows(rows, shape), T, shape), PreparedModel(model, size, **own)
-        assert 0 < len(done.alive) < len(rows)
-        found = prepared.splats(T)
-        for name in ("mean", "factor", "opacity", "color"):
-            np.testing.assert_array_equal(getattr(found, name), getattr(done, name), err_msg=name)
-        np.testing.assert_array_equal(prepared.at(T, np.arange(len(rows)) < 100).alive, done.alive[done.alive < 100])
-        for value, field in ((prepared.spec, "size"), (done, "mean")):
-            with pytest.raises(dataclasses.FrozenInstanceError):
-                setattr(value, field, None)
+    prepared = PreparedModel(model, (48, 200), **own)
+    spec = ConditioningSpec(3, 2.0, np.float32(0.02), (48, 200), aspect=aspect, scale_cutoff=0.02)
+    done = condition(pack(splats), find_windows(pack(splats), spec), T, spec)
+    expected = Splats2D(done.mean, done.factor, done.opacity, done.color)
+    jax.tree.map(np.testing.assert_array_equal, prepared.splats(T), expected)
+    for value, field in ((spec, "size"), (done, "mean")):
+        with pytest.raises(dataclasses.FrozenInstanceError):
+            setattr(value, field, None)
 
 
 BROKEN = np.where(np.isin(np.arange(300), [3, 5, 7])[:, None], [np.nan, 0], 0).astype(np.float32)
@@ -225,10 +210,9 @@ BROKEN = np.where(np.isin(np.arange(300), [3, 5, 7])[:, None], [np.nan, 0], 0).a
     ],
 )
 def test_models_that_cannot_be_prepared_raise(change, message):
-    splats = random_splats()
-    model = VideoModel(dataclasses.replace(splats, **change), FrameTimes.uniform(2), SIZE, 25.0, RenderOptions())
+    splats = dataclasses.replace(random_splats(), **change)
     with pytest.raises(ValueError, match=message):
-        PreparedModel(model, SIZE)
+        PreparedModel(VideoModel(splats, FrameTimes.uniform(2), SIZE, 25.0, RenderOptions()), SIZE)
 
 
 @pytest.mark.parametrize("degree", [0, 3])
