@@ -214,8 +214,7 @@ def test_an_alpha_of_exactly_the_cutoff_is_rendered_and_none_below_it():
     np.testing.assert_allclose([d_opacity, d_color[:, 0]], [[4, 0], [cutoff, 0]], rtol=1e-6)
 
 
-def wide_splats(num, opacity, sigma):
-    """Splats that cover an image of 16 x 32 pixels, with 4 channels."""
+def wide_splats(num, opacity, sigma):  # they cover an image of 16 x 32 pixels
     rng = np.random.default_rng(6)
     leaves = rng.uniform(0, 16, (num, 2)), np.tile(sigma * np.eye(2), (num, 1, 1)), np.full(num, opacity)
     return [np.float32(leaf) for leaf in (*leaves, rng.uniform(size=(num, 4)), [0.2, 0.4, 0.6, 0.8])]
@@ -223,7 +222,7 @@ def wide_splats(num, opacity, sigma):
 
 @pytest.mark.parametrize(("opacity", "stop"), [(0.5, 0.5), (1.0, 0.0)])
 def test_a_transmittance_equal_to_the_stop_ends_a_pixel(opacity, stop):
-    """Image, list and gradients are those of the first splat; alpha is the opacity on every pixel."""
+    # Alpha is the opacity on every pixel: image, list and gradients are those of the first splat.
     leaves, options = wide_splats(130, opacity, 1e6), RenderOptions(alpha_ceiling=1.0, transmittance_stop=stop)
     whole, first = (
         cpu.forward(*(leaf[:num] for leaf in leaves[:4]), leaves[4], (16, 32), options=options) for num in (130, 1)
@@ -238,7 +237,8 @@ def test_tiles_of_one_block_and_of_one_splat_more():
     leaves = wide_splats(65, 0.03, 20)
     leaves[0][-1], leaves[1][-1] = 8, np.eye(2)  # it reaches only the first of the two tiles
     np.testing.assert_array_equal(np.diff(cpu.forward(*leaves, (16, 32)).lists[0][0]), [65, 64])
-    assert_agrees(leaves, (16, 32))
+    for size in ((16, 32), (16, 16)):
+        assert_agrees(leaves, size)
 
 
 @pytest.mark.parametrize("shift", [2, 4])

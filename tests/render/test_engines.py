@@ -105,6 +105,16 @@ def test_lists_end_where_all_pixels_are_finished():
     leaves = [np.asarray(leaf) for leaf in jax.tree.leaves(splats)] + [np.zeros(3, np.float32)]
     trace = cpu.forward(*leaves, size)
     assert sum((stop - start[:-1]).sum() for start, _, stop, _ in trace.lists) * cpu.PIXELS < trace.num_pairs / 2
+    # Pixels of a tile outside the image do not count: these splats do not reach the tile's corner.
+    splats = (
+        np.full((130, 2), 5),
+        np.tile(4 * np.eye(2), (130, 1, 1)),
+        np.full(130, 0.9),
+        np.ones((130, 3)),
+        np.zeros(3),
+    )
+    for size in ((10, 10), (16, 10), (10, 16)):
+        assert cpu.forward(*map(np.float32, splats), size).lists[0][2] == (64 if size == (10, 10) else 130), size
 
 
 @pytest.mark.parametrize("compositing", ["over", pytest.param("sum", marks=pytest.mark.slow)])

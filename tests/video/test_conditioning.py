@@ -125,7 +125,7 @@ def test_scale_cutoff_keeps_the_times_when_both_scales_exceed_it(power, floor, c
 
 
 def test_a_scale_that_equals_the_cutoff_is_left_out():
-    """With power 0 the scale is the same at all times; else it is exp(-power tau^2 / 4) times that of the center."""
+    # With power 0 the scale is the same at all times; else it is exp(-power tau^2 / 4) times that of the center.
     rows, spec = np.zeros((1, 11), np.float32), ConditioningSpec(0, 0.0, 0.0, SIZE)
     for power, cutoff, reach in ((0, 1.0, 0), (0, 0.999, TAU_MAX), (1e3, 1e-200, np.sqrt(800 * np.log(10) / 1e3))):
         window = find_windows(rows, dataclasses.replace(spec, power=float(power), scale_cutoff=cutoff))
@@ -145,7 +145,7 @@ def random_gradients(done):
 
 
 def test_results_do_not_depend_on_the_tasks(monkeypatch):
-    """Tasks of 24 Gaussians, from the last to the first, give the windows, splats and gradients of a single task."""
+    # Tasks of 24 Gaussians, from the last to the first, give the windows, splats and gradients of a single task.
     results = []
     for chunk, run in ((4096, run_tasks), (24, lambda task, starts: [task(start) for start in reversed(starts)])):
         monkeypatch.setattr(conditioning, "CHUNK", chunk)
