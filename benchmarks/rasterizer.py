@@ -142,9 +142,9 @@ def cpp_tasks(trace: cpu.Trace, compiled: ctypes.CDLL) -> tuple[dict[str, Task],
     planes = np.empty_like(trace.image), np.empty_like(trace.transmittance)
     splats, background = (trace.geometry, trace.inputs[2]), np.asarray(trace.constants[0], np.float32)
     row_start, entries, *_ = trace.buckets
-    lengths = np.concatenate([np.diff(start) for start, _, _ in trace.lists])
+    lengths = np.concatenate([np.diff(start) for start, *_ in trace.lists])
     parts = zip(trace.parts, trace.lists, strict=True)
-    listed = np.concatenate([entries[row_start[first] + listed] for (first, _), (_, listed, _) in parts])
+    listed = np.concatenate([entries[row_start[first] + listed] for (first, _), (_, listed, *_) in parts])
     # Tile t, row by row, lists splats listed[start[t] : start[t + 1]], front to back.
     arrays = (np.append(0, np.cumsum(lengths)), listed, *splats, background)
     assert [array.dtype.name for array in arrays] == ["int64", "int32", "float32", "float32", "float32"]
@@ -153,7 +153,7 @@ def cpp_tasks(trace: cpu.Trace, compiled: ctypes.CDLL) -> tuple[dict[str, Task],
 
     def composite() -> None:
         for part in trace.parts:
-            _cpu_kernels.forward_rows(*part, row_start, entries, *splats, *trace.constants, *planes, None, None)
+            _cpu_kernels.forward_rows(*part, row_start, entries, *splats, *trace.constants, *planes)
 
     prepare = functools.partial(_use_threads, 1)
     tasks = {"cpu rows": Task(composite, prepare), "c++": Task(lambda: compiled.exact(*given), prepare)}

@@ -468,7 +468,7 @@ def _list_cells(num, block, first, end, items, stop, shear, rise):
                 items[total + k] = item + (_i(k) << _i(8))
                 shear[total + k] = p * (dx + _f(_i(k) * _i(CELL))) + q * dy
                 rise[total + k] = r * dy
-            total += _u(max(after - column, _i(0)))
+            total += _u(after - column)
         stop[e] = total
     return total
 
@@ -576,18 +576,18 @@ def backward_rows(
     entries, slots = entries[row_start[begin] : row_start[end]], slots[row_start[begin] : row_start[end]]
     slots[:] = 0.0
     scratch, block = _aligned_empty((2 + channels) * PIXELS), _aligned_empty((_COLOR + channels) * BLOCK)
-    size = BLOCK * CELLS * CELLS + CELLS  # with the tail that `_list_cells` writes
+    size = BLOCK * CELLS * CELLS
     items, shear, rise = np.empty(size, np.int32), np.empty(size, np.float32), np.empty(size, np.float32)
     first, after = np.empty(CELLS * BLOCK, np.int32), np.empty(CELLS * BLOCK, np.int32)
     stop = np.empty(BLOCK, np.uint64)
-    stored = _aligned_empty(BLOCK * CELLS * CELLS * _STORED)
+    stored = _aligned_empty(size * _STORED)
     kept = len(block_transmittances)
     for tile in range(len(used) - 1, -1, -1):
         top, left = (begin + tile // across) * TILE, tile % across * TILE
         columns = min(TILE, width - left)
         scratch[_BEHIND:] = 0.0
         for c in range(channels):
-            behind = background[c] if over else _f(0.0)
+            behind = background[c]
             for y in range(min(TILE, height - top)):
                 base, row_of_grad = _u(y * TILE), grad_image[c, top + y, left : left + columns]
                 plane = base + _u(_G + c * PIXELS)

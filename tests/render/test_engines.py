@@ -6,6 +6,7 @@ import os
 import subprocess
 import sys
 import textwrap
+import types
 
 import jax
 import jax.numpy as jnp
@@ -74,8 +75,15 @@ def test_agrees_with_reference(engine, compositing, options, kind):
     judge.check(*found, *judgement, band=2.5 * options.alpha_cutoff)  # a splat more or less
 
 
+def garbage(shape, dtype):
+    return np.full(shape, np.nan if np.issubdtype(dtype, np.floating) else -7, dtype)
+
+
 def test_cpu_in_chunks(monkeypatch):
-    """Splats are shared out in chunks; a scene of several gives the same picture and gradients as one."""
+    """Chunks of splats, rows of tiles and their order change neither the image nor the gradients.
+
+    Nor does what was in the memory before.
+    """
     splats, size = scene("plain")
     leaves = [np.asarray(leaf) for leaf in jax.tree.leaves(splats)] + [np.zeros(3, np.float32)]
     weights = np.random.default_rng(0).normal(size=(3, *size)).astype(np.float32)
@@ -84,6 +92,10 @@ def test_cpu_in_chunks(monkeypatch):
         monkeypatch.setattr(cpu, "SPLATS_PER_TASK", chunk)
         trace = cpu.forward(*leaves, size)
         results.append([trace.image, *cpu.backward(trace, weights)])
+        monkeypatch.setattr(cpu, "SINGLE_TASK_NS", 0)
+        monkeypatch.setattr(cpu, "run_tasks", lambda task, items: [task(item) for item in reversed(items)])
+        monkeypatch.setattr(cpu, "np", types.SimpleNamespace(**{**vars(np), "empty": garbage}))
+    assert len(trace.parts) == 4
     for one, two in zip(*results, strict=True):
         np.testing.assert_array_equal(one, two)
 
@@ -93,6 +105,16 @@ def test_lists_end_where_all_pixels_are_finished():
     leaves = [np.asarray(leaf) for leaf in jax.tree.leaves(splats)] + [np.zeros(3, np.float32)]
     trace = cpu.forward(*leaves, size)
     assert sum((stop - start[:-1]).sum() for start, _, stop, _ in trace.lists) * cpu.PIXELS < trace.num_pairs / 2
+    # Pixels of a tile outside the image do not count: these splats do not reach the tile's corner.
+    splats = (
+        np.full((130, 2), 5),
+        np.tile(4 * np.eye(2), (130, 1, 1)),
+        np.full(130, 0.9),
+        np.ones((130, 3)),
+        np.zeros(3),
+    )
+    for size in ((10, 10), (16, 10), (10, 16)):
+        assert cpu.forward(*map(np.float32, splats), size).lists[0][2] == (64 if size == (10, 10) else 130), size
 
 
 @pytest.mark.parametrize("compositing", ["over", pytest.param("sum", marks=pytest.mark.slow)])
@@ -234,6 +256,10 @@ SLANTED = [
     ([[1e10, 0], [0, 1e-5]], False),
     ([[1e3, 0], [1, 1e-8]], False),
     ([[1, 1e8], [0, 1]], False),
+    ([[8e-7, 0], [0, 1]], False),  # the bound of the thickness is 8.5e-7 px
+    ([[1, 0], [0, 8e-7]], False),
+    ([[9e-7, 0], [0, 1]], True),
+    ([[1, 0], [0, 9e-7]], True),
     ([[1e3, 0], [1e3, 1e-4]], True),
     ([[1e5, 0], [1, 1]], True),
     ([[0, 1e6], [1, 0]], True),

@@ -6,18 +6,24 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from path_models import moving_splats, random_splats
+from path_models import moving_splats, random_paths, random_splats
 
-from foldgauss.render import RenderOptions
+from foldgauss._runtime.threads import run_tasks
+from foldgauss.envelope import TimeLikelihood
+from foldgauss.render import RenderOptions, Splats2D, pixels_per_unit
 from foldgauss.video import FrameTimes, VideoModel
+from foldgauss.video.models import conditioning
 from foldgauss.video.models.conditioning import (
     ConditioningSpec,
+    PreparedModel,
     backpropagate,
     condition,
     find_windows,
+    mirror,
 )
 from foldgauss.video.models.row_layout import columns, pack, unpack
 from foldgauss.video.models.shared_paths import SharedPaths
+from foldgauss.video.models.splats import TAU_MAX
 
 SIZE, T = (48, 80), np.float32(0.4)
 
@@ -116,6 +122,97 @@ def test_scale_cutoff_keeps_the_times_when_both_scales_exceed_it(power, floor, c
     kept = (cut[:, :1] < t) & (t < cut[:, 1:])
     np.testing.assert_array_equal(kept, smaller > cutoff)
     assert 0.2 < kept.mean() < 0.8
+
+
+def test_a_scale_that_equals_the_cutoff_is_left_out():
+    # With power 0 the scale is the same at all times; else it is exp(-power tau^2 / 4) times that of the center.
+    rows, spec = np.zeros((1, 11), np.float32), ConditioningSpec(0, 0.0, 0.0, SIZE)
+    for power, cutoff, reach in ((0, 1.0, 0), (0, 0.999, TAU_MAX), (1e3, 1e-200, np.sqrt(800 * np.log(10) / 1e3))):
+        window = find_windows(rows, dataclasses.replace(spec, power=float(power), scale_cutoff=cutoff))
+        np.testing.assert_allclose(window, [[0.5 - reach, 0.5 + reach]], rtol=1e-6)
+
+
+def test_windows_are_open_intervals_and_only_members_are_alive():
+    rows, spec, _ = twin(random_splats(), 2.0, 0.0)
+    window, members = np.float32([[T, 1], [0, T], [0, 1], [0, 1]]), np.array([True, True, True, False])
+    np.testing.assert_array_equal(condition(rows, window, T, spec).alive, [2, 3])
+    np.testing.assert_array_equal(condition(rows, window, T, spec, members).alive, [2])
+
+
+def random_gradients(done):
+    rng = np.random.default_rng(2)
+    return [rng.normal(size=of.shape).astype(np.float32) for of in (done.mean, done.factor, done.opacity, done.color)]
+
+
+def test_results_do_not_depend_on_the_tasks(monkeypatch):
+    # Tasks of 24 Gaussians, from the last to the first, give the windows, splats and gradients of a single task.
+    results = []
+    for chunk, run in ((4096, run_tasks), (24, lambda task, starts: [task(start) for start in reversed(starts)])):
+        monkeypatch.setattr(conditioning, "CHUNK", chunk)
+        monkeypatch.setattr(conditioning, "run_tasks", run)
+        rows, spec, done = twin(moving_splats(), 2.0, 0.0)
+        grad, path_grad = np.zeros_like(rows), np.zeros((2, 2, 3))
+        d_time = backpropagate(rows, done, random_gradients(done), spec, grad, path_grad)
+        splats = [getattr(done, name) for name in ("alive", "mean", "factor", "opacity", "color", "kept")]
+        results.append([find_windows(rows, spec), grad, *splats, path_grad, d_time])
+    for one, other in zip(*results, strict=True):
+        np.testing.assert_allclose(one, other, rtol=1e-5, atol=1e-7 * np.abs(one).max())
+
+
+def test_rows_without_a_column_of_paths_are_not_moved():
+    rows, spec, done = twin(random_splats(), 2.0, 0.0)
+    resting = condition(rows, find_windows(rows, spec), T, dataclasses.replace(spec, paths=random_paths()))
+    np.testing.assert_array_equal(resting.mean, done.mean)
+    path_grad = np.zeros((2, 2, 3))
+    backpropagate(rows, resting, random_gradients(done), spec, np.zeros_like(rows), path_grad)
+    np.testing.assert_array_equal(path_grad, 0)
+
+
+def test_scales_far_from_their_time_are_accurate():
+    # Down to exp(-70), where the envelope is no normal float32; the gradient is finite.
+    rows, spec = np.zeros((1, 11), np.float32), ConditioningSpec(0, 280 / 9, 0.0, SIZE)
+    done, grad = condition(rows, find_windows(rows, spec), 3.5, spec), np.zeros_like(rows)  # at tau = -3
+    scale = pixels_per_unit(SIZE) * np.exp(-70)
+    np.testing.assert_allclose(np.sqrt(np.sum(np.float64(done.factor) ** 2, axis=1)), [[scale, scale]], rtol=1e-4)
+    assert np.isfinite([backpropagate(rows, done, random_gradients(done), spec, grad), *grad[0]]).all()
+
+
+def test_mirror_reverses_x():
+    mean, factor = np.float32([[3, 5], [50, -1]]), np.arange(8, dtype=np.float32).reshape(2, 2, 2)
+    expected = [[37, 5], [-10, -1]], [[[0, -1], [2, 3]], [[-4, -5], [6, 7]]]
+    for found, truth in zip(mirror(mean, factor, 40), expected, strict=True):
+        np.testing.assert_array_equal(found, truth)
+
+
+@pytest.mark.parametrize(("own", "aspect"), [({}, 0.6), ({"aspect": 1.5}, 1.5)])
+def test_prepared_models_have_the_models_settings(own, aspect):
+    # The envelope, the cutoff of scales, and the aspect of the model's frame unless another is given.
+    splats = random_splats(floor=0.02)
+    model = VideoModel(splats, FrameTimes.uniform(2), SIZE, 25.0, RenderOptions(), scale_cutoff=0.02)
+    prepared = PreparedModel(model, (48, 200), **own)
+    spec = ConditioningSpec(3, 2.0, np.float32(0.02), (48, 200), aspect=aspect, scale_cutoff=0.02)
+    done = condition(pack(splats), find_windows(pack(splats), spec), T, spec)
+    expected = Splats2D(done.mean, done.factor, done.opacity, done.color)
+    jax.tree.map(np.testing.assert_array_equal, prepared.splats(T), expected)
+    for value, field in ((spec, "size"), (done, "mean")):
+        with pytest.raises(dataclasses.FrozenInstanceError):
+            setattr(value, field, None)
+
+
+BROKEN = np.where(np.isin(np.arange(300), [3, 5, 7])[:, None], [np.nan, 0], 0).astype(np.float32)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"loc": BROKEN}, "^model: .* others in 3 Gaussians"),
+        ({"envelope": TimeLikelihood(np.float32(np.arange(300) % 2))}, r"envelope.power: .* 2 different ones"),
+    ],
+)
+def test_models_that_cannot_be_prepared_raise(change, message):
+    splats = dataclasses.replace(random_splats(), **change)
+    with pytest.raises(ValueError, match=message):
+        PreparedModel(VideoModel(splats, FrameTimes.uniform(2), SIZE, 25.0, RenderOptions()), SIZE)
 
 
 @pytest.mark.parametrize("degree", [0, 3])

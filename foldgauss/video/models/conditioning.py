@@ -57,17 +57,16 @@ def _windows(at, start, stop, indices, rows, power, floor, cuts, log_cutoff, win
     for k in range(start, stop):
         i, tau = indices[k], at.tau_max
         if cuts:
-            tau = min(
-                tau, _longest(min(rows[i, at.log_scale], rows[i, at.log_scale + 1]) - log_cutoff, power, floor, tau)
-            )
+            smaller = min(rows[i, at.log_scale], rows[i, at.log_scale + 1])
+            tau = min(tau, _longest(smaller - log_cutoff, power, floor))
         center, reach = _sigmoid(rows[i, at.time_loc_logit]), tau * math.exp(rows[i, at.log_time_scale])
         window[i, 0] = center - reach
         window[i, 1] = center + reach
 
 
 @inline
-def _longest(margin, power, floor, most):
-    """The largest |tau|, up to `most`, with log a(tau) > -2 margin; 0 if there is none.
+def _longest(margin, power, floor):
+    """The largest |tau| with log a(tau) > -2 margin; 0 if there is none, infinite if all have it.
 
     That is (1 - floor) exp(-power tau^2 / 2) > exp(-2 margin) - floor.
     """
@@ -77,8 +76,6 @@ def _longest(margin, power, floor, most):
     if floor > 0:
         # Infinite where the envelope never gets so small.
         square = math.log((1 - floor) / max(math.exp(-2 * margin) - floor, _f(0.0)))
-    if 2 * square >= power * most * most:
-        return most
     return _f(math.sqrt(2 * square / power))
 
 
@@ -245,10 +242,8 @@ def _move(start, stop, alive, rows, maps, mean, factor):
 
 
 @kernel
-def _move_back(
-    start, stop, alive, rows, maps, inverse, moved_mean, moved_factor, mean, factor, d_mean, d_factor, by_map
-):
-    """Gradients of splats before `_move`, and those by the maps; means and factors as they were before.
+def _move_back(start, stop, alive, rows, maps, inverse, moved_mean, moved_factor, factor, d_mean, d_factor, by_map):
+    """Gradients of splats before `_move`, and those by the maps; factors as they were before.
 
     `d_mean` and `d_factor` come in as gradients of the moved splats, and are changed in place.
     """
@@ -264,7 +259,6 @@ def _move_back(
         a, b, c, d = moved_factor[k, 0, 0], moved_factor[k, 0, 1], moved_factor[k, 1, 0], moved_factor[k, 1, 1]
         a, c = w[0, 0] * a + w[0, 1] * c, w[1, 0] * a + w[1, 1] * c
         b, d = w[0, 0] * b + w[0, 1] * d, w[1, 0] * b + w[1, 1] * d
-        mean[k, 0], mean[k, 1] = x, y
         factor[k, 0, 0], factor[k, 0, 1], factor[k, 1, 0], factor[k, 1, 1] = a, b, c, d
         if path != summed:
             out = by_map[summed]
@@ -375,20 +369,19 @@ def backpropagate(
     dL/dt is that with the maps of shared paths as they are at t. Gradients by these maps, in model space, are added to
     `path_grad` (paths, 2, 3).
     """
-    num = len(done.alive)
-    by_time = np.zeros(-(-num // CHUNK))
+    num, starts = len(done.alive), range(0, len(done.alive), CHUNK)
+    by_time = np.zeros(len(starts))
     power, floor = np.float32(spec.power), np.float32(spec.floor)
     factor, (d_mean, d_factor, *others) = done.factor, gradients
     if done.maps is not None:
-        own_mean, own_factor = np.empty_like(done.mean), np.empty_like(done.factor)
+        factor = np.empty_like(done.factor)
         d_mean, d_factor = np.array(d_mean, np.float32), np.array(d_factor, np.float32)
         by_map, inverse = np.zeros((len(by_time), *done.maps.shape)), invert_maps(done.maps)
-        factor = own_factor
 
     def work(start: int) -> None:
         stop = min(start + CHUNK, num)
         if done.maps is not None:
-            own, by = (own_mean, own_factor, d_mean, d_factor), by_map[start // CHUNK]
+            own, by = (factor, d_mean, d_factor), by_map[start // CHUNK]
             _move_back(start, stop, done.alive, rows, done.maps, inverse, done.mean, done.factor, *own, by)
         by_time[start // CHUNK] = _pull_back(
             _LAYOUT,
@@ -411,7 +404,7 @@ def backpropagate(
             grad,
         )
 
-    run_tasks(work, range(0, num, CHUNK))
+    run_tasks(work, starts)
     if done.maps is not None and path_grad is not None:
         height, width = spec.size
         path_grad += from_pixel_gradient(by_map.sum(0), float(done.unit), np.array([width / 2, height / 2]))
