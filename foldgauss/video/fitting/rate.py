@@ -122,7 +122,7 @@ USUAL_COARSENESS = 6.0
 #: The least fraction of the Gaussians that remains: each is judged as if the others remained.
 _LEAST_KEPT = 0.45
 #: Squared error that sorting may add, as a fraction of the model's own, which many passes compensate for.
-_ORDERING = 1.0
+_ORDERING = 0.1
 #: Passes over the frames to come that count as many; fewer compensate for less of what an action costs.
 _PASSES = 40.0
 #: The least fraction of the price of a bit at which Gaussians are dropped where nothing makes up for them.
