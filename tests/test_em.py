@@ -169,6 +169,15 @@ def test_each_restart_ends_for_itself(x64, monkeypatch):
     np.testing.assert_allclose(moved, np.repeat([[2.0], [0.0], [4.0]], K, 1), rtol=1e-12)
 
 
+def test_a_run_whose_start_has_no_likelihood_ends_without_a_warning(x64, monkeypatch):
+    values = iter(jnp.array([[-np.inf, 0.0], [-np.inf, 1.0], [-np.inf, 1.0]]))
+    rest = jnp.ones((2, K)), jnp.zeros((2, K), bool), jnp.zeros(2)
+    monkeypatch.setattr(loop, "step", lambda states, *_: (states, loop.Info(next(values), *rest)))
+    starts = jax.tree.map(lambda z: jnp.stack([z] * 2), _params())
+    runs = run_em(starts, None, Constant(), _model(), total=1.0)
+    assert [run.status for run in runs] == [EMStatus.NOT_FINITE, EMStatus.CONVERGED]
+
+
 def _steps_with_mass(monkeypatch, *masses):
     """`loop.step` leaves the components as they are, and finds these masses."""
     left = iter(masses)
