@@ -30,6 +30,7 @@ def run(arguments: list[str]) -> tuple[int, list[str]]:
         child = os.fork()
         if child == 0:
             resource.setrlimit(resource.RLIMIT_CPU, (LIMIT, LIMIT))
+            resource.setrlimit(resource.RLIMIT_AS, (12 << 30, 12 << 30))  # a mutant may allocate without end
             os.dup2(output.fileno(), 1)
             os.dup2(output.fileno(), 2)
             # JAX's libraries import a plugin of pytest, which warns that it cannot rewrite its assertions.

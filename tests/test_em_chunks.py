@@ -194,7 +194,8 @@ def test_first_of_equal_runs_is_selected():
     run = loop.Run(params, [2.0], loop.EMStatus.CONVERGED)
     broken = run._replace(status=loop.EMStatus.NOT_FINITE, history=[9.0])
     lost = broken._replace(history=[])
-    for ends, expected in [((2, 2 + 1e-14), 0), ((2, 2 + 3.5e-14), 1), ((2 - 1e-14, 1, 2), 0), ((1, 3, 2), 1)]:
+    # A relative difference of 64 epsilons is rounding.
+    for ends, expected in [((2, 2 + 2**-45), 0), ((2, 2 + 65 * 2**-51), 1), ((2 - 1e-14, 1, 2), 0), ((1, 3, 2), 1)]:
         runs = [run._replace(history=[end, np.nan]) for end in ends]
         assert loop.select_best([broken, *runs]) is runs[expected]
     assert loop.select_best([lost, broken]) is broken

@@ -158,7 +158,7 @@ def run_em(
     """
     first_end = 1 if annealing == 1.0 else ANNEALING_STEPS + SETTLING_STEPS
     states, restarts = State(starts, jnp.ones_like(starts.time_loc)), len(starts.time_loc)
-    before, lasts = states, np.full(restarts, -np.inf)
+    before, lasts = states, np.full(restarts, np.nan)
     statuses = np.full(restarts, EMStatus.NOT_CONVERGED)
     done, resets, histories = np.zeros(restarts, bool), np.zeros(restarts, int), [[] for _ in range(restarts)]
     for number in range(1, max_steps + 1):
@@ -168,7 +168,8 @@ def run_em(
         new, info = step(states, points, envelope, model, beta)
         values, rejected = np.asarray(info.log_likelihood) / total, np.asarray(info.rejected) / total
         broken = ~done & ~np.isfinite(values)
-        small = (np.abs(values - lasts) < tol) & (rejected < max(tol, 1e-12)) & (number >= first_end)
+        changes = np.abs(np.where(np.isfinite(values), values, np.nan) - lasts)
+        small = (changes < tol) & (rejected < max(tol, 1e-12)) & (number >= first_end)
         lasts, running = np.where(done, lasts, values), ~done
         for r in np.flatnonzero(running):
             histories[r].append(float(values[r]))

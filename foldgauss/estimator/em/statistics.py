@@ -115,7 +115,7 @@ class Blocks(NamedTuple):
     dtype: np.dtype
     num_components: int
     size: int  # points in all chunks
-    devices: int = 1
+    devices: int
 
 
 def sum_over_points(function: Callable, points: Points | Blocks, *arguments):
@@ -132,14 +132,12 @@ def sum_over_points(function: Callable, points: Points | Blocks, *arguments):
 
 
 def _add(total, more):
-    """Add pytrees of sums in float64; None is zero."""
-    if more is None:
-        return total
+    """Add pytrees of sums in float64; a total of None is zero. Where both are None, so is the sum."""
     more = jax.tree.map(lambda z: np.asarray(z, np.float64), more)
     return more if total is None else jax.tree.map(np.add, total, more)
 
 
-def make_blocks(rows: Iterable[tuple], size: int, num_components: int, devices: int = 1) -> Iterator[Points]:
+def make_blocks(rows: Iterable[tuple], size: int, num_components: int, devices: int) -> Iterator[Points]:
     """Regroup `rows`, (points, weights) of any lengths, `size` in all, to blocks of one shape: compiled once."""
     most = devices * _CHUNKS_PER_BLOCK * _rows_per_chunk(num_components)
     size, held, count = min(devices * _padded_rows(-(-size // devices)), most), [], 0
@@ -210,7 +208,7 @@ def _weigh_responsibilities(log_density: Float[Array, "n k"], weights: Float[Arr
     largest = jnp.where(jnp.isneginf(largest), 0, largest)
     density = jnp.exp(log_density - largest[:, None])
     total = density.sum(-1)
-    share = jnp.where(total == 0, 0, weights / jnp.where(total == 0, 1, total))
+    share = weights / jnp.where(total == 0, 1, total)
     return jnp.log(total) + largest, density * share[:, None]
 
 
