@@ -136,8 +136,8 @@ def test_fourier_is_its_series_and_stays_finite_far_away():
         np.testing.assert_allclose(tiny, [-0.5e-24], rtol=1e-12)
     far = FourierFold([[1.0]], [[1.0]], period=1e-15)  # its square is still representable
     both = jax.vmap(jax.value_and_grad(lambda f, u: f(u).sum(), argnums=(0, 1)), in_axes=(None, 0))
-    values, grads = jax.jit(both)(far, jnp.array([1e30, -3e38, 1e10, 0.0]))
-    np.testing.assert_array_equal(values, np.zeros(4))
+    values, grads = jax.jit(both)(far, jnp.array([1e30, -3e38, 1e10, 0.0, far.period / jnp.finfo(jnp.float32).eps]))
+    np.testing.assert_array_equal(values, np.zeros(5))
     assert all(np.isfinite(x).all() for x in jax.tree.leaves((values, grads)))
     assert np.isnan(APPLY(far, np.array(np.nan, np.float32))).all()
 
