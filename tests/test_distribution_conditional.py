@@ -300,6 +300,7 @@ def test_what_is_given_adds_its_own_error_to_that_of_every_point():
     expected = np.full((3, 5), given.time.error_estimate)
     np.testing.assert_array_equal(given.error_estimate(np.zeros((3, 5, 2))), expected, strict=True)
     assert np.isneginf(given.log_prob([np.inf, 0.5]))
+    assert given.marginal(0).event_shape == (1,)
     assert not given.has_rsample  # times are drawn by quantiles, which have no gradient
 
 
