@@ -184,16 +184,26 @@ def test_modes_of_time_are_where_the_parabola_passes():
 def test_times_at_which_a_ridge_comes_near_are_solved_to_rounding():
     """Whitened, the residuals are r / scale and (offset - r / 2) / scale: their squares are least at r = 0.4 offset."""
     scale, offset = 1e-3, 1e-6
-    tril, fold = scale * np.array([[1.0, 0.0], [0.5, 1.0]]), lambda u: jnp.stack([jnp.sin(2 * jnp.pi * u), 0 * u])
-    dist = FoldedGaussian(np.zeros(2), tril, time_loc=0.0, time_scale=1.0, fold=fold)
-    guides, near = jax.jit(lambda s: _guides(dist, s, _log_joint_frozen(dist, s)))(jnp.array([0.5, offset]))
+    tril = scale * np.array([[1.0, 0.0], [0.5, 1.0]])
+
+    @jax.jit
+    def find(s, end):
+        """In a wave that ends at some distance from time_loc."""
+        fold = lambda u: jnp.stack([jnp.sin(2 * jnp.pi * jnp.clip(u, -end, end)), 0 * u])  # noqa: E731
+        dist = FoldedGaussian(np.zeros(2), tril, time_loc=0.0, time_scale=1.0, fold=fold)
+        return _guides(dist, s, _log_joint_frozen(dist, s))
+
     turn = np.arcsin(0.5 - 0.4 * offset) / (2 * np.pi)
     expected = np.ravel(np.arange(-20.0, 20)[:, None] - [turn, 0.5 - turn])
     expected = expected[np.argsort(np.abs(expected))]
-    # The 24 nearest to time_loc, and first of all the 10 of most mass, whatever their density.
-    np.testing.assert_allclose(np.sort(near), np.sort(expected[:24]), rtol=1e-13, atol=1e-14)
-    np.testing.assert_allclose(guides[:10], expected[:10], rtol=1e-13, atol=1e-14)
-    assert guides.size == 10 + 6  # and 6 maxima of the density
+    for end in (np.inf, 4.0):  # more times than are kept, and fewer: the others are NaN
+        guides, near = find(jnp.array([0.5, offset]), jnp.asarray(end))
+        # The 10 of most mass come first, whatever their density, and then 6 maxima of the density.
+        np.testing.assert_allclose(guides[:10], expected[:10], rtol=1e-13, atol=1e-14)
+        assert guides.size == 10 + 6
+        found = np.sort(near)[:24] if end == np.inf else np.sort(near[:16])
+        np.testing.assert_allclose(found, np.sort(expected[: found.size]), rtol=1e-13, atol=1e-14)
+        assert near.size == 24
 
 
 def test_maxima_with_no_valley_between_them_are_one():
@@ -551,6 +561,7 @@ def test_the_estimated_error_near_a_ridge_is_the_effect_of_rounding():
     log_density = 2 * np.log(sharp / scale) - np.log(2 * np.pi * 0.7) - 0.5 * (tau**2 + np.where(on, 0, z) ** 2)
     log_part = log_density + log_width - log_p
     log_part -= np.where(log_width < -7, 0, 0.5 * np.log(2 * np.pi))  # a wide ridge bends
+    np.testing.assert_allclose(log_part[scale == 1e-9], 0, atol=1e-5)  # all of the mass is there, and found
     with np.errstate(over="ignore"):  # far out nothing is known of log p
         change = q * (z + q + 0.1)
     reached = np.minimum(0, log_part + np.where(on, np.log(np.maximum(1, q)), 2 * change))
