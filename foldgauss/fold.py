@@ -182,7 +182,7 @@ class FourierFold(AbstractFold):
 
         f(u) = sum_{k=1..order} s_k sin(2 pi k u / period) + c_k (cos(2 pi k u / period) - 1)
 
-    Beyond 1 / eps periods, where the phase is below floating-point resolution, f is 0.
+    From 1 / eps periods on, where the phase is below floating-point resolution, f is 0.
 
     **Shapes:** `sine`, `cosine` (*batch, order, d-1), row `k - 1` is s_k, c_k; `period` (*batch,); u (*batch,) ->
     (*batch, d-1), leading dimensions broadcast.
@@ -222,7 +222,7 @@ class FourierFold(AbstractFold):
     @vectorized(0)
     def __call__(self, u: Float[Array, "*#batch"]) -> Float[Array, "*#batch d-1"]:
         u = u.astype(self.sine.dtype) if jnp.issubdtype(u.dtype, jnp.integer) else u
-        far = jnp.abs(u) > self.period / float(jnp.finfo(u.dtype).eps)
+        far = jnp.abs(u) >= self.period / float(jnp.finfo(u.dtype).eps)
         half_phase = jnp.pi * jnp.where(far, 0, u) / jnp.where(far, 1, self.period)
         shift = jnp.zeros(self.sine.shape[-1], u.dtype)
         first = s, c = jnp.sin(half_phase), jnp.cos(half_phase)

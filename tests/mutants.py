@@ -15,6 +15,7 @@ test of behavior can see them) are in `REVIEWED` with the reason, by their lines
 
 import ast
 import functools
+import importlib.util
 import json
 import os
 import random
@@ -211,6 +212,8 @@ def try_mutant(mutant: Mutant, checkout: Checkout, killers: Iterable[str] = ()) 
     mutated = mutate(source, mutant.index)
     try:
         path.write_text(mutated)
+        # Python would take the bytecode of another mutant of the same length and second.
+        Path(importlib.util.cache_from_source(path)).unlink(missing_ok=True)
         passed, last = checkout.run_tests([mutant.module], killers)
     finally:
         path.write_text(source)

@@ -231,11 +231,13 @@ def test_far_points_do_not_spoil_a_networks_gradient():
 
 @pytest.mark.parametrize("changes", [{}, pytest.param({"fold": ZeroFold(2)}, marks=pytest.mark.slow)])
 def test_absurd_times_are_minus_infinity(changes):
-    both = jax.vmap(jax.value_and_grad(FoldedGaussian.log_prob, argnums=(0, 1)), in_axes=(None, 0))
-    x = jnp.array([[0.0, 1.0, t] for t in (1e20, -1e30, 3e38)])
-    values, grads = jax.jit(both)(folded(**changes), x)
-    assert np.isneginf(values).all()
-    assert all((np.asarray(g) == 0).all() for g in jax.tree.leaves(grads))
+    both = jax.jit(jax.vmap(jax.value_and_grad(FoldedGaussian.log_prob, argnums=(0, 1)), in_axes=(None, 0)))
+    x = jnp.array([[0.0, 1.0, t] for t in (1e20, -1e30, 3e38, 1e10)])
+    one = PolynomialFold([[0.0, 0.0], [1e30, 0.0]])  # at 1e10 it overflows in one coordinate
+    for dist in (folded(**changes), folded(fold=one)):
+        values, grads = both(dist, x)
+        assert np.isneginf(values).all()
+        assert all((np.asarray(g) == 0).all() for g in jax.tree.leaves(grads))
 
 
 def test_nan_in_nan_out():
@@ -248,9 +250,11 @@ def test_nan_in_nan_out():
 def test_an_envelope_of_minus_infinity_is_no_nan():
     class Nothing(AbstractEnvelope):
         def log_a(self, t, *, time_loc, time_scale):
-            return jnp.full(jnp.broadcast_shapes(t.shape, time_loc.shape), -jnp.inf, t.dtype)
+            return jnp.where(jnp.abs(t - time_loc) < jnp.inf, -jnp.inf, jnp.zeros_like(t))
 
-    assert np.isneginf(LOG_PROB(folded(envelope=Nothing()), jnp.array([1.0, 1.0, 0.0])))
+    dist = folded(envelope=Nothing())
+    assert np.isneginf(LOG_PROB(dist, jnp.array([1.0, 1.0, 0.0])))
+    assert np.isfinite(LOG_PROB(dist, jnp.append(dist.loc, dist.time_loc)))  # on the ridge
 
 
 # --- transformations and batches --------------------------------------------------------------------------
@@ -274,6 +278,7 @@ def test_any_parameter_may_carry_the_batch(changes):
     shape = lambda call: jax.eval_shape(call).shape  # noqa: E731
     key = jax.random.key(0)
     assert dist.batch_shape == batch
+    assert all(leaf.shape[: len(batch)] == batch for leaf in jax.tree.leaves(dist))  # slices are distributions
     assert shape(lambda: dist.log_prob(jnp.zeros(3))) == batch
     assert shape(lambda: dist.sample(key, (2,))) == (2, *batch, 3)
     assert jax.eval_shape(lambda: dist.condition_time(0.1)).batch_shape == batch
@@ -339,6 +344,8 @@ def test_callables_are_folds():
     network = eqx.nn.MLP("scalar", 2, 4, 1, key=jax.random.key(0))
     dist = folded(fold=network)
     assert jax.jit(lambda d: d.log_prob(jnp.zeros(3)))(dist).shape == ()
+    copies = [leaf.shape[0] for leaf in jax.tree.leaves(folded(fold=network, loc=jnp.zeros((3, 2))).fold)]
+    assert set(copies) == {1}  # parameters of a callable are not copied for each component
     stack = jax.jit(jax.vmap(lambda loc: folded(fold=network, loc=loc)))(jnp.zeros((3, 2)))
     alone = LOG_PROB(folded(fold=network, loc=jnp.zeros(2)), jnp.zeros(3))
     _close(LOG_PROB(stack, jnp.zeros(3)), jnp.full(3, alone), 1e-5)
@@ -472,6 +479,7 @@ def test_values_are_not_looked_at_under_tracing_or_on_request():
     broken = folded(time_scale=-1.0, loc=jnp.full(2, jnp.nan), envelope=own, validate_args=False)
     assert np.isnan(broken.condition_time(0.3).loc).all()
     assert np.isnan(broken.marginal([0, -1]).loc).all()
+    assert broken.marginal([-1]).loc == jnp.float32(0.4)
 
 
 def test_a_function_that_returns_a_instead_of_its_logarithm_is_refused():

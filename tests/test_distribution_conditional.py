@@ -1,6 +1,7 @@
 """Marginals and conditionals of a Folded-Gaussian: exact ones, and those integrated over time."""
 
 import pickle
+from functools import partial
 
 import equinox as eqx
 import jax
@@ -10,7 +11,7 @@ import pytest
 from folded import BEND, CONDITION_TIME, LOC, LOG_PROB, SAMPLE, TRIL, folded
 from scipy import stats
 
-from foldgauss.analysis.conditional import TimeMixture, _mixture_moments
+from foldgauss.analysis.conditional import TimeMixture, _guides, _log_joint_frozen, _mixture_moments, _same_top
 from foldgauss.analysis.quadrature import SEARCH_GRID, adaptive_panels, find_peaks, gauss_hermite, normal_panels
 from foldgauss.distribution import FoldedGaussian
 from foldgauss.envelope import CallableEnvelope, TimeLikelihood
@@ -88,6 +89,7 @@ def test_marginal_with_time_is_a_folded_gaussian(fold):
     np.testing.assert_allclose(part.covariance_matrix, at.covariance_matrix[np.ix_([2, 0], [2, 0])], rtol=1e-13)
     assert isinstance(dist.marginal([3]), Gaussian)
     np.testing.assert_allclose(dist.marginal([3]).log_prob(0.5), stats.norm(0.4, 0.3).logpdf(0.5))
+    assert dist.marginal([0, 1]).event_shape == (2,)
 
 
 def test_conditioning_with_time_is_the_gaussian_of_the_book():
@@ -100,6 +102,16 @@ def test_conditioning_with_time_is_the_gaussian_of_the_book():
     np.testing.assert_allclose(gaussian.loc, mean[2:] + gain @ (np.array([0.2, -0.3]) - mean[:2]), rtol=1e-12)
     np.testing.assert_allclose(gaussian.covariance_matrix, sigma[2:, 2:] - gain @ sigma[:2, 2:], rtol=1e-11)
     np.testing.assert_allclose(dist.condition([3], [0.7]).loc, at.loc)
+    in_turn = dist.condition(1, [-0.3]).condition([0, -1], [0.2, 0.7])
+    np.testing.assert_allclose(in_turn.loc, gaussian.loc, rtol=1e-12)
+    np.testing.assert_allclose(in_turn.covariance_matrix, gaussian.covariance_matrix, rtol=1e-11)
+
+
+def test_a_marginal_of_a_conditional_is_a_conditional_of_a_marginal():
+    dist, x = folded(3), np.array([[0.4, 0.5], [0.1, 0.9]])
+    one, other = dist.condition(1, [-0.3]).marginal([1, -1]), dist.marginal([1, 2, 3]).condition(0, [-0.3])
+    assert one.event_shape == (2,)
+    np.testing.assert_allclose(one.log_prob(x), other.log_prob(x), rtol=1e-12)
 
 
 # --- time given space -------------------------------------------------------------------------------------
@@ -163,9 +175,56 @@ def test_modes_of_time_are_where_the_parabola_passes():
     modes = density.modes()
     # Accurate to the square root of rounding.
     np.testing.assert_allclose(np.sort(modes[:, :2]), 0.4 + away * np.array([[-1, 1]]), atol=2e-7)
+    assert modes.shape == (MANY, 8)
     assert np.isnan(modes[:, 2:]).all()
     np.testing.assert_allclose(density.cdf(jnp.full((7, 1, 1), 0.4)), 0.5, atol=1e-10)
     np.testing.assert_allclose(density.mean, 0.4, atol=1e-10)
+
+
+def test_times_at_which_a_ridge_comes_near_are_solved_to_rounding():
+    """Whitened, the residuals are r / scale and (offset - r / 2) / scale: their squares are least at r = 0.4 offset."""
+    scale, offset = 1e-3, 1e-6
+    tril = scale * np.array([[1.0, 0.0], [0.5, 1.0]])
+
+    @jax.jit
+    def find(s, end):
+        """In a wave that ends at some distance from time_loc."""
+        fold = lambda u: jnp.stack([jnp.sin(2 * jnp.pi * jnp.clip(u, -end, end)), 0 * u])  # noqa: E731
+        dist = FoldedGaussian(np.zeros(2), tril, time_loc=0.0, time_scale=1.0, fold=fold)
+        return _guides(dist, s, _log_joint_frozen(dist, s))
+
+    turn = np.arcsin(0.5 - 0.4 * offset) / (2 * np.pi)
+    expected = np.ravel(np.arange(-20.0, 20)[:, None] - [turn, 0.5 - turn])
+    expected = expected[np.argsort(np.abs(expected))]
+    for end in (np.inf, 4.0):  # more times than are kept, and fewer: the others are NaN
+        guides, near = find(jnp.array([0.5, offset]), jnp.asarray(end))
+        # The 10 of most mass come first, whatever their density, and then 6 maxima of the density.
+        np.testing.assert_allclose(guides[:10], expected[:10], rtol=1e-13, atol=1e-14)
+        assert guides.size == 10 + 6
+        found = np.sort(near)[:24] if end == np.inf else np.sort(near[:16])
+        np.testing.assert_allclose(found, np.sort(expected[: found.size]), rtol=1e-13, atol=1e-14)
+        assert near.size == 24
+
+
+def test_maxima_with_no_valley_between_them_are_one():
+    """Pairs of maxima, each with a valley halfway, whose depth is in tolerances and distance in its limit."""
+    eps = np.finfo(np.float64).eps
+    depth = np.array([0.7, 1.5, 0.0, 0.7, 1.5, 0.0, 0.7, 1.5])
+    distance = np.array([0.8, 0.8, 1.3, 0.8, 0.8, 1.3, 0.8, 0.8])
+    place, height = np.array([0.0, 1.0, -2.0, 7.0, 8.0, 9.0, 30.0, 40.0]), np.r_[np.repeat([0.1, -100.0], 3), 0.5, -7.0]
+    first, second = place, place + distance * eps**0.25 * (1 + np.abs(place))
+    tolerance = 64 * eps * np.maximum(1, np.abs(height))
+
+    def log_f(x):
+        middle, part, top, low = jnp.array([0.5 * (first + second), second - first, height, depth * tolerance])
+        of = jnp.abs(x[..., None] - middle).argmin(-1)
+        return top[of] - jnp.where(jnp.abs(x - middle[of]) < 0.1 * part[of], low[of], 0)
+
+    found, heights = np.ravel([first, second], "F"), np.repeat(height, 2)
+    with jax.numpy_rank_promotion("allow"):
+        same = jax.jit(partial(_same_top, log_f))(np.append(found, np.nan), np.append(heights, -np.inf))
+    is_one = (depth < 1) & (distance < 1)
+    np.testing.assert_array_equal(same, np.append(np.ravel([is_one & False, is_one], "F"), False))
 
 
 @pytest.mark.slow  # it compiles for long
@@ -248,7 +307,10 @@ def test_space_given_space_against_its_definition():
 
 def test_what_is_given_adds_its_own_error_to_that_of_every_point():
     given = folded(2).condition(0, [0.1])
-    np.testing.assert_array_equal(given.error_estimate(np.zeros((5, 2))), np.full(5, given.time.error_estimate))
+    expected = np.full((3, 5), given.time.error_estimate)
+    np.testing.assert_array_equal(given.error_estimate(np.zeros((3, 5, 2))), expected, strict=True)
+    assert np.isneginf(given.log_prob([np.inf, 0.5]))
+    assert given.marginal(0).event_shape == (1,)
     assert not given.has_rsample  # times are drawn by quantiles, which have no gradient
 
 
@@ -467,6 +529,59 @@ def test_estimated_errors_near_a_ridge_are_no_smaller_than_the_errors(num):
     assert (typical < [60, 60, 300]).all()  # and no larger than they have to be; measured: 21, 22, 136
 
 
+def test_the_estimated_error_near_a_ridge_is_the_effect_of_rounding():
+    """At whitened distance z the rounding q changes log p by q (z + q), where the mass near this time is p(s).
+
+    The ridge is a straight line, which is passed once (u) or twice (u^2).
+    """
+    tril, speed, eps = np.array([[1.0, 0.0], [0.3, 0.7]]), 0.3 * np.array([0.8, -0.5]), np.finfo(np.float64).eps
+    cases = np.stack(np.meshgrid([1e-11, 1e-9, 1e-4, 3e-3], [0.5, -3.0], [0, 0.8, 4], [0.0, 1.0], 1), -1).reshape(-1, 5)
+    rare = [[1e-18, 0.5, 0, 0, 1], [1e-17, 1, 0, 1, 1], [2e-19, 0, 0, 1, 1], [1e-9, 0, 0, 1, 1], [1e-4, 40, 0, 1, 1]]
+    rare += [[1e-11, 1, 0, 0, 2], [1e-14, 1, 1, 0, 2], [1e-14, 1, 3, 0, 2]]
+    scale, tau, z, power, times = np.concatenate([cases, rare]).T
+    inverse, sharp, column = np.linalg.inv(tril) / scale[:, None, None], np.exp(power * tau**2 / 4), tau[:, None]
+    place = (-column) ** times[:, None] * speed
+    moved = times[:, None] * column ** (times[:, None] - 1) * speed
+    rate = (inverse @ moved[..., None])[..., 0]
+    side = np.stack([-rate[:, 1], rate[:, 0]], -1) / np.linalg.norm(rate, axis=-1)[:, None]
+    s = place + (scale * z / sharp)[:, None] * (side @ tril.T)
+    dist = FoldedGaussian(
+        np.zeros((len(s), 2)),
+        tril * scale[:, None, None],
+        time_loc=0.4,
+        time_scale=0.3,
+        fold=PolynomialFold((times[:, None] == [1, 2])[..., None] * np.stack([speed / 0.3, speed / 0.09])),
+        envelope=TimeLikelihood(power),
+    )
+    found = dist.time_given_space(s).time
+    log_p, error = np.asarray(found.log_normalizer), np.asarray(found.error_estimate)
+    size = np.abs(s) + np.abs(place) + np.abs(column * moved)
+    q = eps * sharp * np.linalg.norm((np.abs(inverse) @ size[..., None])[..., 0], axis=-1)
+    on, log_width = z <= 2 * q, -np.log(sharp * np.linalg.norm(rate, axis=-1))
+    log_density = 2 * np.log(sharp / scale) - np.log(2 * np.pi * 0.7) - 0.5 * (tau**2 + np.where(on, 0, z) ** 2)
+    log_part = log_density + log_width - log_p
+    log_part -= np.where(log_width < -7, 0, 0.5 * np.log(2 * np.pi))  # a wide ridge bends
+    np.testing.assert_allclose(log_part[scale == 1e-9], 0, atol=1e-5)  # all of the mass is there, and found
+    with np.errstate(over="ignore"):  # far out nothing is known of log p
+        change = q * (z + q + 0.1)
+    reached = np.minimum(0, log_part + np.where(on, np.log(np.maximum(1, q)), 2 * change))
+    expected = times * (change * np.exp(reached) + np.where(on & (log_part > 0.1), log_part, 0))
+    rounding = 20 * eps * np.maximum(1, np.abs(log_p))
+    assert (error > 0.97 * np.minimum(expected, 1e50)).all()
+    assert (error < 1.08 * expected + rounding).all()
+    assert (expected > 3 * rounding).sum() > 40  # and those of the others are seen not to be larger
+    # In one coordinate rounding moves a crossing, and changes the mass only where the curve turns back: to 0 or twice.
+    line = folded(1, 0.0, loc=[0.0], scale_tril=[[1e-17]], fold=PolynomialFold([[0.8], [0.6]]))
+    at_turn = line.time_given_space(_repeated(-(0.8**2) / 2.4)).time.error_estimate
+    np.testing.assert_allclose(at_turn, np.full(MANY, 1.05), atol=0.05)
+
+
+def test_the_density_of_space_does_not_depend_on_time_loc():
+    density = folded(1, time_loc=np.array([0.4, 0.0, -3e3, 1e9, 7e12, 1.0, 2.0, 3.0])).time_given_space([0.3])
+    log_p = np.asarray(density.time.log_normalizer)
+    np.testing.assert_array_equal(log_p, np.full(MANY, log_p[0]))
+
+
 @pytest.mark.slow
 def test_a_ridge_that_quadrature_misses_is_said_to_be():
     """Panels are wider than a ridge of 1e-13. The estimated error is the mass of that ridge, a Gaussian integral."""
@@ -596,6 +711,10 @@ def test_indices_are_checked(indices, expected):
         (
             lambda dist: dist.marginal([0, 1]).modes(),
             "modes: expected the distribution of time given space, got 2 coordinates",
+        ),
+        (
+            lambda dist: dist.condition(0, [0.1]).icdf(0.5),
+            "icdf: expected the distribution of time given space, got 2 coordinates",
         ),
         (lambda dist: dist.marginal([0, 1]).log_prob(np.zeros(3)), "value: expected shape "),
     ],

@@ -271,6 +271,7 @@ def test_normal_points_are_transformed_with_their_density():
     x, log_det = dist.normal_to_fold(z), np.linalg.slogdet(jacobian(z))[1]
     standard = -0.5 * (z**2).sum(-1) - 1.5 * np.log(2 * np.pi)
     np.testing.assert_allclose(LOG_PROB(dist, x), standard - log_det, rtol=1e-11)
+    np.testing.assert_allclose(x[..., 2], 0.4 + 0.3 * z[..., 2], rtol=1e-14)
 
 
 # --- doors ------------------------------------------------------------------------------------------------

@@ -138,6 +138,11 @@ def test_bad_input_names_the_parameter(arguments, name):
         TimeLikelihood(**arguments)
 
 
+@pytest.mark.parametrize("envelope", ENVELOPES)
+def test_only_functions_of_users_are_not_closed(envelope):
+    assert envelope.is_closed == (not isinstance(envelope, CallableEnvelope))
+
+
 def test_integers_and_weak_types_become_floats():
     envelope = TimeLikelihood(np.array([1, 2]), 0)
     assert (envelope.power.dtype, envelope.floor.dtype) == (jnp.float32, jnp.float32)
@@ -192,6 +197,9 @@ def test_plain_envelope_agrees_until_a_underflows_and_is_held_beyond(dtype, edge
         np.testing.assert_allclose(values[3:], math.log(jnp.finfo(dtype).tiny), rtol=1e-6)
         assert np.isfinite(slopes).all()
         assert np.isnan(AT(plain_envelope(_plain), np.array(np.nan, dtype)))
+        least = jnp.finfo(dtype).tiny  # a itself, which is still a normal number
+        slope = jax.grad(lambda a: _at(plain_envelope(lambda t, m, scale: t), a))
+        np.testing.assert_allclose(slope(least), 1 / least, rtol=1e-6)
 
 
 @pytest.mark.parametrize(

@@ -51,7 +51,7 @@ FOLDS = {
     "zero": lambda: ZeroFold(2),
     "degree 0": lambda: PolynomialFold(jnp.zeros((0, 2))),
     "cubic": lambda: PolynomialFold([[1.0, -2.0], [0.5, 0.25], [0.1, 3.0]]),
-    "spline": lambda: SplineFold(KNOTS, np.arange(10.0).reshape(5, 2) ** 1.5, degree=3),
+    "spline": lambda: SplineFold(KNOTS, np.arange(10.0).reshape(5, 2) ** 1.5),  # of degree 3
     "steps": lambda: SplineFold([-1.0, 0.0, 0.5], [[1.0, 2.0], [3.0, -1.0]], degree=0),
     "fourier": lambda: FourierFold([[1.0, -2.0], [0.5, 0.25]], [[0.3, 1.0], [0.0, -1.0]], period=1.7),
     "path": lambda: SharedPathFold(FOLDS["cubic"](), [0.3, -1.0], time_loc=0.25, index=2, **PATHS),
@@ -114,6 +114,12 @@ def test_spline_equals_scipy_and_is_held_outside(x64, knots, degree):
     assert np.isnan(nan).all()
 
 
+@pytest.mark.parametrize(("knots", "degree"), [([-1, 0, 1, 1], 0), ([0, 0, 1, 1, 2], 1)])
+def test_a_spline_that_jumps_at_the_end_of_its_domain_keeps_the_value_before(knots, degree):
+    fold = SplineFold(knots, [[1.0], [2.0], [3.0]], degree=degree)
+    np.testing.assert_allclose(fold(jnp.array([0.9999999, 1.0, 5.0])), [[2.0]] * 3, rtol=1e-6)
+
+
 def test_fourier_is_its_series_and_stays_finite_far_away():
     rng = np.random.default_rng(0)
     sine, cosine = rng.normal(size=(2, 3, 2))
@@ -130,7 +136,8 @@ def test_fourier_is_its_series_and_stays_finite_far_away():
         np.testing.assert_allclose(tiny, [-0.5e-24], rtol=1e-12)
     far = FourierFold([[1.0]], [[1.0]], period=1e-15)  # its square is still representable
     both = jax.vmap(jax.value_and_grad(lambda f, u: f(u).sum(), argnums=(0, 1)), in_axes=(None, 0))
-    values, grads = jax.jit(both)(far, jnp.array([1e30, -3e38, 1e10, 0.0]))
+    values, grads = jax.jit(both)(far, jnp.array([1e30, -3e38, 1e10, 0.0, far.period / jnp.finfo(jnp.float32).eps]))
+    np.testing.assert_array_equal(values, np.zeros(5))
     assert all(np.isfinite(x).all() for x in jax.tree.leaves((values, grads)))
     assert np.isnan(APPLY(far, np.array(np.nan, np.float32))).all()
 
@@ -181,10 +188,12 @@ def test_as_fold_wraps_only_what_is_no_fold(fold):
     [
         (lambda: PolynomialFold([1.0, 2.0]), "coefficients"),
         (lambda: PolynomialFold(jnp.zeros((3, 0))), "coefficients"),
+        (lambda: PolynomialFold(jnp.zeros((4, 2, 0))), "coefficients"),
         (lambda: ZeroFold(0), "dim"),
         (lambda: SplineFold([0, 1, 2], [[1.0], [2.0]], degree=1), "knots"),
         (lambda: SplineFold([0, 2, 1, 3], [[1.0], [2.0]], degree=1), "knots"),
         (lambda: SplineFold([0, 1, 1, 3], [[1.0], [2.0]], degree=1), "knots"),
+        (lambda: SplineFold([0, 1, 0.5, 2, 3], [[1.0], [2.0], [3.0]], degree=1), "knots"),
         (lambda: SplineFold([0, 1, 2, 3], [[1.0], [2.0]], degree=-1), "degree"),
         (lambda: SplineFold([0, 1], [1.0], degree=0), "coefficients"),
         (lambda: FourierFold([1.0], [[1.0]], period=1.0), "sine"),
@@ -209,6 +218,27 @@ def test_integers_become_floats():
     assert PolynomialFold([[1], [2]]).coefficients.dtype == jnp.float32
     wave = FourierFold([[1.0]], [[0.5]], period=4.0)
     np.testing.assert_array_equal(wave(1), wave(1.0))
+
+
+def test_points_of_higher_precision_decide_the_dtype(fold):
+    with jax.enable_x64(True), jax.numpy_dtype_promotion("standard"):
+        assert jax.eval_shape(fold, jax.ShapeDtypeStruct((), jnp.float64)).dtype == jnp.float64
+
+
+def test_coefficients_below_the_smallest_normal_number_warn():
+    tiny = np.finfo(np.float32).tiny
+    PolynomialFold(np.float32([[0.0], [1.0], [tiny]]))  # warnings are errors
+    with pytest.warns(RuntimeWarning, match="coefficients below 1.2e-38, the smallest normal float32, count as 0"):
+        PolynomialFold(np.float32([[1.0], [tiny / 2]]))
+
+
+@pytest.mark.parametrize("kind", ["zero", "cubic"])
+def test_some_coordinates_of_a_fold_are_of_its_class(kind):
+    """For these classes moments are exact."""
+    fold, u = FOLDS[kind](), np.float32([-0.5, 2.0])
+    kept = FoldedGaussian(np.zeros(2), np.eye(2), time_loc=0.0, time_scale=1.0, fold=fold).marginal([1, -1]).fold
+    assert type(kept) is type(fold)
+    np.testing.assert_array_equal(APPLY(kept, u), APPLY(fold, u)[:, 1:])
 
 
 def test_numpy_integers_are_integers():
@@ -261,6 +291,11 @@ def test_a_path_moves_the_anchor_with_its_own_fold():
         got, home = APPLY(fold, u), fold.home
         np.testing.assert_array_equal(APPLY(fold, np.zeros(num)), np.zeros((num, 2)))
         along = APPLY(fold, jnp.asarray(u[:, None]))
+        without = APPLY(fold.fold, u)
+        paths = {name: np.broadcast_to(x, (num, *x.shape)) for name, x in PATHS.items()}  # each its own
+        batched = APPLY(SharedPathFold(fold.fold, anchor, time_loc=time_loc, index=index, **paths), u)
+    np.testing.assert_array_equal(got[index == 0], without[index == 0])
+    np.testing.assert_allclose(batched, got, rtol=1e-12, atol=1e-12)
     for k in range(num):
         g = sum(own[k, j] * u[k] ** (j + 1) for j in range(3))
         expected, start = g, anchor[k]
@@ -290,6 +325,7 @@ def test_breaks_of_a_path_are_its_knots_and_those_of_its_own_fold():
     for index, path in ((0, 0), (1, 0), (2, 1)):
         fold = SharedPathFold(own, [0.3, -1.0], time_loc=0.25, index=index, **PATHS)
         np.testing.assert_allclose(fold.breaks, [*(0.25 - PATHS["times"][path]), *own.breaks], rtol=1e-6)
+    assert FOLDS["cubic"]().breaks.shape == (0,)
 
 
 @pytest.mark.parametrize("fold", FOLDS)

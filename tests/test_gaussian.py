@@ -86,3 +86,9 @@ def test_standard_deviations_do_not_underflow():
         squared = Gaussian(jnp.zeros(2), factor * jnp.array([[3.0, 0.0], [3.0, 4.0]]))
         np.testing.assert_allclose(squared.stddev, factor * np.array([3.0, 5.0]), rtol=1e-15)
     assert jnp.isinf(Gaussian(jnp.zeros(1), jnp.array([[jnp.inf]]), validate_args=False).stddev).all()
+
+
+def test_jitted_code_may_close_over_a_gaussian_of_any_scale():
+    """XLA computes with constants beforehand, and sums and products of them in another order."""
+    narrow, x = Gaussian([0.0], [[1.0]], log_scale=-800.0), jnp.array([[0.0], [1e-300], [1e-307], [1.0]])
+    np.testing.assert_allclose(jax.jit(lambda x: narrow.log_prob(x))(x), narrow.log_prob(x), rtol=1e-6)

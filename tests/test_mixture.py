@@ -153,9 +153,10 @@ def test_chunks_hold_few_pairs_of_point_and_component(monkeypatch):
         return function(pairs(rows))
 
     monkeypatch.setattr(mixture_module, "map_in_chunks", chunks)
-    monkeypatch.setattr(mixture_module, "_CHUNK", 100)
-    _mixture().log_prob(_points(39))
-    assert seen == [100 // 3]
+    for pairs, num in ((100, 39), (2, 38)):  # other shapes: each is traced
+        monkeypatch.setattr(mixture_module, "_CHUNK", pairs)
+        jax.eval_shape(_mixture().log_prob, jax.ShapeDtypeStruct((num, 3), jnp.float32))
+    assert seen == [100 // 3, 1]
 
 
 # --- normalisation, draws and moments, each with what would be seen to be wrong ------------------------------
@@ -175,6 +176,7 @@ def _deviations(draws, mean):
 
 def test_draws_have_the_moments_and_the_weights(drawn):
     mixture, (x, component) = _mixture(), drawn
+    assert not mixture.has_rsample
     assert x.shape == (DRAWS, 3)
     assert component.shape == (DRAWS,)
     one_hot = component[:, None] == np.arange(3)
@@ -308,7 +310,7 @@ def test_cdf_and_quantiles_of_a_gaussian_mixture(x64):
     levels = np.array([1e-6, 0.2, 0.5, 0.999])[:, None]
     quantiles = one.icdf(levels)
     assert quantiles.shape == (4, 2, 1)
-    np.testing.assert_allclose(one.cdf(quantiles), np.broadcast_to(levels, (4, 2)), rtol=1e-9)
+    np.testing.assert_allclose(one.cdf(quantiles), np.broadcast_to(levels, (4, 2)), rtol=3e-14)
     assert np.isneginf(one.icdf(0.0)).all()
     half = Mixture(one.components, logits=np.log([[np.nan] * 3, [0.3, 0.4, 0.3]]), validate_args=False)
     np.testing.assert_array_equal(np.isnan(half.icdf(0.5)), [[True], [False]])
@@ -359,6 +361,9 @@ def test_nothing_of_a_broken_component_without_weight_is_seen():
     np.testing.assert_allclose(mixture.responsibilities(x).sum(-1), 1, rtol=1e-6)
     line = Gaussian([[0.0], [np.nan], [1.0]], np.ones((3, 1, 1), np.float32), validate_args=False)
     np.testing.assert_allclose(Mixture(line, weights=[0.5, 0.0, 0.5]).icdf(0.5), [0.5], rtol=1e-5)
+    # Where the distribution function is 0.5 from 6 to 94, the quantile is the least number at which it is.
+    line = Gaussian([[0.0], [np.nan], [100.0]], np.ones((3, 1, 1), np.float32), validate_args=False)
+    assert 4 < Mixture(line, weights=[0.5, 0.0, 0.5]).icdf(0.5) < 7
 
 
 def test_far_points_and_offsets():
@@ -494,6 +499,7 @@ WRONG = {
     "components: one": lambda: FoldedMixture(
         FoldedGaussian([0.0], [[1.0]], time_loc=0.0, time_scale=1.0), weights=[1.0]
     ),
+    "components: two times none": lambda: Mixture(Gaussian(np.zeros((2, 0, 1)), np.eye(1)), weights=np.zeros((2, 0))),
     "value: two": lambda: _mixture().log_prob(jnp.zeros(2)),
     "indices: all": lambda: _mixture().condition([0, 1, 2], jnp.zeros(3)),
     "indices: all of space": lambda: _mixture().condition_time(0.3).condition([0, 1], jnp.zeros(2)),
