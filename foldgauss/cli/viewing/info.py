@@ -124,7 +124,7 @@ def _describe_degrees(model: VideoModel | EditedVideo) -> dict[str, str]:
         return {}
     degrees = np.concatenate([splats.degrees for splats in parts])
     counts = zip(*np.unique(degrees, return_counts=True), strict=True)
-    return {"degrees": ", ".join(f"{degree} of {count:,} Gaussians" for degree, count in counts)}
+    return {"degrees": ", ".join(f"{count:,} Gaussians of degree {degree}" for degree, count in counts)}
 
 
 def _describe_times(times: np.ndarray) -> str:
