@@ -295,7 +295,7 @@ def _sum(terms: Columns) -> Float[Array, "*#batch"]:
 def times_exp(y: Float[Array, "*#batch"], c: Float[Array, "*#batch"]):
     """y exp(c), infinite only where the product is, not where exp(c) is."""
     largest = float(np.log(jnp.finfo(y.dtype).max)) * 0.999  # slightly less: its exp must not round to inf
-    # The barrier: of a constant c XLA would multiply half by half first, which overflows.
+    # Where c is a constant, XLA would compute half * half first, which overflows; the barrier prevents it.
     half = lax.optimization_barrier(jnp.exp(0.5 * jnp.clip(c, -2 * largest, 2 * largest)))
     return y * half * half
 

@@ -310,9 +310,23 @@ def _cdf(mixture: Mixture, x: Array) -> Array:
     return jnp.clip(weighted_sum(mixture.weights, mixture.components.cdf(_add_component_axis(mixture, x))), 0, 1)
 
 
+def _to_ordinal(x: Array) -> Array:
+    """Unsigned integers in the order of the floats x, of as many bits: neighbors differ by 1."""
+    bits = lax.bitcast_convert_type(x, jnp.dtype(f"uint{8 * x.itemsize}"))
+    return jnp.where(jnp.signbit(x), ~bits, bits | bits.dtype.type(1 << (8 * x.itemsize - 1)))
+
+
+def _from_ordinal(ordinal: Array, dtype) -> Array:
+    top = ordinal.dtype.type(1 << (8 * ordinal.itemsize - 1))
+    return lax.bitcast_convert_type(jnp.where(ordinal >= top, ordinal ^ top, ~ordinal), dtype)
+
+
 @eqx.filter_jit
 def _icdf(mixture: Mixture, q: Array) -> Array:
-    """Bisection between the least and the greatest of the components' quantiles."""
+    """Bisection between the least and the greatest of the components' quantiles, over all floats between them.
+
+    Halving the interval itself would not get near a quantile about 0 between components that are far apart.
+    """
     weights, quantiles = mixture.weights, lax.stop_gradient(mixture.components.icdf(q[..., None]))[..., 0]
 
     def ends(weights, quantiles):
@@ -322,9 +336,10 @@ def _icdf(mixture: Mixture, q: Array) -> Array:
     low, high, is_nan = vectorize(ends, (weights, 1), (quantiles, 1))
     q = jnp.broadcast_to(q, low.shape)
 
-    inner = jnp.isfinite(low) & jnp.isfinite(high)
-    ends = (jnp.where(inner, end, 0) for end in (low, high))
-    found = bisect(lambda x: _cdf(mixture, x[..., None]) < q, *ends, jnp.finfo(q.dtype).nmant + 8)[1]
+    inner, bits = jnp.isfinite(low) & jnp.isfinite(high), jnp.finfo(q.dtype).bits
+    ends = (_to_ordinal(jnp.where(inner, end, 0)) for end in (low, high))
+    found = bisect(lambda n: _cdf(mixture, _from_ordinal(n, q.dtype)[..., None]) < q, *ends, bits)[1]
+    found = _from_ordinal(found, q.dtype)
     return lax.stop_gradient(jnp.where(is_nan, jnp.nan, jnp.where(inner, found, low)))[..., None]
 
 

@@ -138,8 +138,19 @@ def test_bad_input_names_the_parameter(arguments, name):
         TimeLikelihood(**arguments)
 
 
+def test_a_class_that_returns_a_is_refused_even_where_it_is_closed():
+    class Own(AbstractEnvelope):
+        is_closed = True
+
+        def log_a(self, t, *, time_loc, time_scale):
+            return jnp.ones(jnp.shape(t))
+
+    with pytest.raises(ValueError, match=r"^envelope: expected log a <= 0 at time_loc, got 1.0"):
+        FoldedGaussian([0.0], [[1.0]], time_loc=0.0, time_scale=1.0, fold=lambda u: u[None], envelope=Own())
+
+
 @pytest.mark.parametrize("envelope", ENVELOPES)
-def test_only_functions_of_users_are_not_closed(envelope):
+def test_only_functions_are_not_closed(envelope):
     assert envelope.is_closed == (not isinstance(envelope, CallableEnvelope))
 
 

@@ -312,6 +312,9 @@ def test_cdf_and_quantiles_of_a_gaussian_mixture(x64):
     assert quantiles.shape == (4, 2, 1)
     np.testing.assert_allclose(one.cdf(quantiles), np.broadcast_to(levels, (4, 2)), rtol=3e-14)
     assert np.isneginf(one.icdf(0.0)).all()
+    # Between components far apart the quantile is 0 to 1e-15, not to the distance divided by 2^60.
+    far = Mixture(Gaussian(np.array([[0.0], [1e30]]), np.ones((2, 1, 1))), weights=[0.5, 0.5])
+    np.testing.assert_allclose(far.icdf(jnp.array([0.25, 0.75]))[:, 0], [0, 1e30], rtol=1e-15, atol=1e-15)
     half = Mixture(one.components, logits=np.log([[np.nan] * 3, [0.3, 0.4, 0.3]]), validate_args=False)
     np.testing.assert_array_equal(np.isnan(half.icdf(0.5)), [[True], [False]])
     pair = Mixture(Gaussian(np.zeros((2, 2)), np.eye(2)), weights=[0.5, 0.5])

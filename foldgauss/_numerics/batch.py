@@ -257,11 +257,11 @@ def check_positive(name: str, x: Array, cure: str = "It is a standard deviation.
 
 
 def bisect(is_below: Callable[[Array], Array], low: Array, high: Array, steps: int) -> tuple[Array, Array]:
-    """Halve the intervals from `low`, where `is_below` is true, to `high`, where it is not."""
+    """Halve the intervals from `low`, where `is_below` is true, to `high`, where it is not: floats or unsigned ints."""
 
     def halve(_, bounds):
         low, high = bounds
-        middle = low + 0.5 * (high - low)
+        middle = low + lax.div(high - low, jnp.full_like(high, 2))
         below = is_below(middle)
         return jnp.where(below, middle, low), jnp.where(below, high, middle)
 

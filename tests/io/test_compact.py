@@ -696,7 +696,7 @@ def changed(path, change, model=None):
 
 
 def spread(distance):
-    """A change of a path's arrays: those of the first knot become `-distance`, others `distance`."""
+    """A change of a path's arrays: the values at the first knot become `-distance`, the others `distance`."""
     return lambda own: (
         np.where(np.arange(own.shape[1]) > 0, distance, -distance).astype(np.float32).reshape(-1, *[1] * (own.ndim - 2))
         + 0 * own

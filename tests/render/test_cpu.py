@@ -165,7 +165,7 @@ def reached_squares(leaves, size, side, slack):
     ("kind", "change"), [("plain", None), ("plain", touch), ("needles", touch), ("tiny", touch), ("tiny", None)]
 )
 def test_lists_hold_the_splats_that_reach_a_tile_and_its_cells(kind, change):
-    """None is missing, and none is listed whose ellipse is more than 0.3% too small to reach the pixel centers."""
+    """No cell is missing; a listed cell is reached by the ellipse when that is enlarged by 0.3%."""
     leaves, size = leaves_of(kind, change=change)
     trace, num, (down, across) = cpu.forward(*leaves, size), len(leaves[2]), np.ceil(np.divide(size, 16)).astype(int)
     (start, listed, *_), (_, entries, first_slot, _) = trace.lists[0], trace.buckets

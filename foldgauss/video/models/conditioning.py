@@ -66,7 +66,7 @@ def _windows(at, start, stop, indices, rows, power, floor, cuts, log_cutoff, win
 
 @inline
 def _longest(margin, power, floor):
-    """The largest |tau| with log a(tau) > -2 margin; 0 if there is none, infinite if all have it.
+    """The largest |tau| with log a(tau) > -2 margin: 0 if no tau satisfies it, infinity if every tau does.
 
     That is (1 - floor) exp(-power tau^2 / 2) > exp(-2 margin) - floor.
     """
