@@ -92,7 +92,7 @@ def test_a_model_whose_leaves_do_not_fit_is_not_written(tmp_path):
 def test_info_tells_of_lower_degrees(tmp_path):
     path = save_video_model(tmp_path / "m.safetensors", random_model(np.where(np.arange(NUM) < 20, 3, 0)))
     parameters, size = f"{load_video_model(path).num_parameters:,}", f"{path.stat().st_size:,} bytes"
-    call("info", path, out=["0 of 30 Gaussians, 3 of 20 Gaussians", parameters, size])
+    call("info", path, out=["30 Gaussians of degree 0, 20 Gaussians of degree 3", parameters, size])
     whole = save_video_model(tmp_path / "whole.safetensors", random_model(np.full(NUM, 3)))
     assert "degrees" not in call("info", whole).out
 
