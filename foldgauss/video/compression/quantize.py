@@ -690,7 +690,7 @@ def describe_paths(model: VideoModel) -> PathsInfo:
 def round_paths(about: PathsInfo, paths: SharedPaths) -> dict[str, Int32[np.ndarray, "..."]]:
     """The integers of the maps and, unless they are at the frames, of their times.
 
-    Their magnitudes, and those of their differences, which the file stores, are at most `LARGEST`.
+    The integers, and the differences between them that the file stores, have magnitudes of at most `LARGEST`.
     """
     rounded = {"maps": np.rint(np.asarray(paths.matrices, np.float64) * 2.0**about.bits)}
     rounded |= {} if about.at_frames else {"knots": np.rint(np.asarray(paths.times, np.float64) / KNOT_STEP)}
