@@ -938,7 +938,7 @@ def test_smallest_and_largest_constants_are_read(tmp_path, good):
 
 
 def test_values_beyond_float32_are_rejected(tmp_path):
-    """Even those of a single Gaussian."""
+    """One value of one Gaussian is enough."""
     quantized = fine(soft_model(degree=3))
     own = with_columns(quantized, x3=np.eye(1, NUM, dtype=np.int32)[0], degree=np.full(NUM, 3, np.int32))
     rules = own.rules | {"duration": Rule(-40.0, 0.0), "x3": Rule(0.0, 60.0)}

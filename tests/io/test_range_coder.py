@@ -19,7 +19,7 @@ def columns():
         yield f"normal {scale}", np.clip(rng.normal(size=5000) * scale, -largest, largest)
     # A weighted sum of logits is one below a multiple of 65536 here, which is rare.
     yield "below", np.random.default_rng(1353).normal(size=40) * 3
-    # So many ones among the bits that the interval still begins where it did after several bytes.
+    # The bits are nearly all ones, so that the start of the interval does not move for several bytes.
     yield "late", np.concatenate([np.zeros(20_000), np.tile([largest, 0, -1, -largest], 50)])
     # Each number is what the ones before made unlikely: dearer than it is long.
     yield "spiteful", np.concatenate([np.zeros(4000), np.tile([largest, 0, -1, -largest], 1000)])

@@ -222,7 +222,7 @@ def wide_splats(num, opacity, sigma):  # they cover an image of 16 x 32 pixels
 
 @pytest.mark.parametrize(("opacity", "stop"), [(0.5, 0.5), (1.0, 0.0)])
 def test_a_transmittance_equal_to_the_stop_ends_a_pixel(opacity, stop):
-    # Alpha is the opacity on every pixel: image, list and gradients are those of the first splat.
+    # Alpha is the opacity on every pixel: image, list and gradients equal the ones of the first splat alone.
     leaves, options = wide_splats(130, opacity, 1e6), RenderOptions(alpha_ceiling=1.0, transmittance_stop=stop)
     whole, first = (
         cpu.forward(*(leaf[:num] for leaf in leaves[:4]), leaves[4], (16, 32), options=options) for num in (130, 1)

@@ -125,7 +125,7 @@ def test_scale_cutoff_keeps_the_times_when_both_scales_exceed_it(power, floor, c
 
 
 def test_a_scale_that_equals_the_cutoff_is_left_out():
-    # With power 0 the scale is the same at all times; else it is exp(-power tau^2 / 4) times that of the center.
+    # With power 0 the scale is constant. Otherwise it is the scale at tau = 0, times exp(-power tau^2 / 4).
     rows, spec = np.zeros((1, 11), np.float32), ConditioningSpec(0, 0.0, 0.0, SIZE)
     for power, cutoff, reach in ((0, 1.0, 0), (0, 0.999, TAU_MAX), (1e3, 1e-200, np.sqrt(800 * np.log(10) / 1e3))):
         window = find_windows(rows, dataclasses.replace(spec, power=float(power), scale_cutoff=cutoff))
