@@ -15,7 +15,6 @@ import pytest
 from soft_models import NUM, SIZE, assert_same, crowd, of_degrees, on_paths, only, soft_model
 
 import foldgauss.video.compression.chunks as chunks_module
-from foldgauss.envelope import TimeLikelihood
 from foldgauss.io import ModelFileError, load_compact, load_video_model, save_compact
 from foldgauss.io.models.compact import (
     MAGIC,
@@ -750,10 +749,6 @@ REFUSED = {
         )
         for value in np.float32([np.nan, np.inf])
     },
-    "powers": (
-        lambda: compress(changed("splats.envelope", lambda own: TimeLikelihood(np.linspace(1, 2, 40)))),
-        "several|different",
-    ),
     "edits": (
         lambda: compress(layers(soft_model(), soft_model())),
         "model: expected a VideoModel, got EditedVideo",

@@ -113,6 +113,8 @@ def test_splats_of_a_mixture_are_rendered():
     np.testing.assert_allclose(at.color, color, rtol=1e-5, atol=1e-6)
     np.testing.assert_allclose(at.opacity.max(), 0.99, rtol=1e-5)
     np.testing.assert_allclose(at.mean, mixture.components.condition_time(0.5).loc, rtol=1e-4, atol=1e-5)
+    traced = jax.jit(lambda own: FoldedSplats.from_mixture(own, color=color).at(jnp.asarray(0.5)))(mixture)
+    np.testing.assert_allclose(traced.factor, at.factor, rtol=1e-4, atol=1e-6)
 
 
 def test_round_covariances_and_dead_components_become_splats():
@@ -138,6 +140,7 @@ WRONG = [
         lambda: splats_of(envelope=CallableEnvelope(lambda t, m, scale: -jnp.abs(t - m))),
         "mixture.components.envelope",
     ),
+    (lambda: splats_of(envelope=TimeLikelihood(np.float32([1, 1, 2, 1, 1]))), "envelope.power"),
     (lambda: splats_of(color=[1.0, 1.0]), "color"),
     (lambda: splats_of(color=[1.0, 1.0, -0.1]), "color"),
     (lambda: FoldedSplats.from_mixture(LINE, color=[1.0, 1.0, 1.0]), "mixture"),

@@ -13,7 +13,6 @@ from path_models import path_model
 from scipy.ndimage import map_coordinates, spline_filter
 from soft_models import NUM, NUM_FRAMES, OBJECT, SIZE, assert_same, only, soft_model
 
-from foldgauss.envelope import TimeLikelihood
 from foldgauss.render import Camera, RenderOptions, cpu
 from foldgauss.video import (
     Clock,
@@ -321,14 +320,6 @@ def test_copies_stand_behind_their_originals():
     both = edit(MODEL).select(OBJECT).multiply([(0.1, 0)], originals=True)
     assert len(both.selection) == 2 * OBJECT.sum()
     assert not chain.selection.mask[~np.repeat(OBJECT, np.where(OBJECT, 3, 1))].any()
-
-
-def test_an_envelope_of_each_ones_own_goes_with_it():
-    powers = np.linspace(1, 2, NUM).astype(np.float32)
-    model = dataclasses.replace(MODEL, splats=dataclasses.replace(MODEL.splats, envelope=TimeLikelihood(powers, 0.1)))
-    envelope = edit(model).select(OBJECT).multiply([(0.1, 0)]).video().splats.envelope
-    np.testing.assert_array_equal(envelope.power, np.repeat(powers, np.where(OBJECT, 2, 1)))
-    assert envelope.floor == np.float32(0.1)
 
 
 def test_copies_have_their_own_edits_and_times():

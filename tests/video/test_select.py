@@ -11,7 +11,6 @@ from hypothesis import strategies as st
 from object_clips import BACKGROUND, BOX, COLOR, DISC, NUM_FRAMES, SPEED, START, named_model, square, textured_clip
 from soft_models import soft_model
 
-from foldgauss.envelope import TimeLikelihood
 from foldgauss.video import (
     FitConfig,
     FrameTimes,
@@ -436,8 +435,6 @@ def test_frames_with_open_ends():
 
 
 BROKEN = eqx.tree_at(lambda m: m.splats.loc, MODEL, np.full_like(MODEL.splats.loc, np.nan))
-MANY = TimeLikelihood(np.linspace(1, 2, len(LABEL), dtype=np.float32), 0.3)
-MIXED = eqx.tree_at(lambda m: m.splats.envelope, MODEL, MANY)
 ALL, THREE = Selection.all(MODEL), np.zeros(3, bool)
 WRONG_CALLS = [
     *((lambda mask=mask: Selection(mask), r"mask: expected bool \(num_gaussians,\)") for mask in (0 * THREE, [1, 0])),
@@ -451,7 +448,6 @@ WRONG_CALLS = [
         "selection: expected a selection of 3 Gaussians, got one",
     ),
     (lambda: by_color(BROKEN, (0, 0, 0)), "model: expected finite numbers"),
-    (lambda: by_color(MIXED, (0, 0, 0)), r"model\.splats\.envelope\.power: expected one number"),
     (lambda: matte(MODEL.splats, ALL, 0.5), "model: expected a VideoModel, got FoldedSplats"),
     (lambda: by_click("model.safetensors", (1, 1), frame=0), "model: expected a VideoModel, got str"),
     (lambda: matte(MODEL, Selection(THREE), 0.5), "selection"),

@@ -131,16 +131,14 @@ def write_vegas_ply(path: PathLike, model: VideoModel) -> Path:
     columns |= {f"f_dc_{c}": np.asarray(splats.color_dc, np.float64)[:, c] for c in range(3)}
     columns |= {"opacity": splats.opacity_logit, "scale_0": scale[:, 0]}
     columns |= {"scale_1": np.full(len(loc), _VEGAS_ACROSS), "scale_2": scale[:, 1]}
-    powers = np.asarray(splats.envelope.power, np.float64)
-    spread = _convert_time_scale(np.asarray(splats.log_time_scale, np.float64), powers, VEGAS_POWER)
+    power = float(splats.envelope.power)
+    spread = _convert_time_scale(np.asarray(splats.log_time_scale, np.float64), power, VEGAS_POWER)
     columns |= {"rot_0": splats.angle_logit, "m_0": splats.time_loc_logit, "sigma_0": spread}
     weights = (plane * np.asarray(splats.coefficients, np.float64)).reshape(len(loc), -1)
     columns |= {f"w1_{k}": weights[:, k] for k in range(weights.shape[1])}
     times = {f"time_func_{k}": [weight] for k, weight in enumerate(np.asarray(model.frame_times.logits))}
     note = {"size": list(model.size), "fps": model.fps, "options": dataclasses.asdict(model.options)}
-    note["scale_cutoff"] = model.scale_cutoff
-    if np.unique(powers).size == 1:
-        note["power"] = float(np.unique(powers)[0])
+    note |= {"scale_cutoff": model.scale_cutoff, "power": power}
     return write_ply(path, {"vertex": columns, "time": times}, comments=[NOTE + json.dumps(note)])
 
 
@@ -159,7 +157,7 @@ def write_vegas_segments(folder: PathLike, video: SegmentedVideo, *, overwrite: 
 
 
 def _convert_time_scale(
-    log_time_scale: Float[np.ndarray, " num"], power: float | Float[np.ndarray, "*#num"], other: float
+    log_time_scale: Float[np.ndarray, " num"], power: float, other: float
 ) -> Float[np.ndarray, " num"]:
     """log sigma_t that gives an envelope of power `other` the same values."""
     return log_time_scale + 0.5 * np.log(other / power)
@@ -252,12 +250,12 @@ def _check_writable_as_vegas(model: VideoModel) -> None:
         got="1",
         cure="Write the picture as a still scene, ply3dgs.",
     )
-    floors = np.unique(model.splats.envelope.floor)
+    envelope = model.splats.envelope
     require(
-        (floors == 0).all(),
+        envelope.floor == 0,
         "model's floor",
         expected="0.0, the only one in a VeGaS file",
-        got=", ".join(map(str, floors[:3])),
+        got=float(envelope.floor),
         cure="Fit it without a floor.",
     )
     require(
@@ -275,7 +273,7 @@ def _check_writable_as_vegas(model: VideoModel) -> None:
         cure="The fit diverged: fit again.",
     )
     require(
-        (np.asarray(model.splats.envelope.power) > 0).all(),
+        envelope.power > 0,
         "model's power",
         expected="above 0, as VeGaS files require",
         got="0",

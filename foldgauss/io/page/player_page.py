@@ -167,7 +167,7 @@ def html_page(
     `linked`: the name of a compact file beside the page, with the model, which is then not in the page, and which the
     page may ask its own server for. Not for videos in segments.
 
-    Raises ValueError for edits that no folded model holds, several envelopes or a degree above 15, in a segment, too,
+    Raises ValueError for edits that no folded model holds, a degree above 15, in a segment, too,
     for frames that do not fit, and for `linked` segments; its subclass `NothingMoves`; errors of reading as
     `load_video_model`.
 

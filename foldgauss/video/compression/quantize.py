@@ -474,21 +474,8 @@ def _sigmoid(x: np.ndarray) -> np.ndarray:
     return 0.5 * (1 + np.tanh(0.5 * x))
 
 
-def envelope_of_all(model: VideoModel) -> tuple[float, float]:
-    """The power and the floor of the envelope. Raises ValueError unless all Gaussians have the same."""
-    power, floor = (np.unique(np.asarray(getattr(model.splats.envelope, name))) for name in ("power", "floor"))
-    require(
-        power.size == floor.size == 1,
-        "model.splats.envelope",
-        expected="one for all Gaussians",
-        got="several",
-        cure="Save it as .safetensors, which holds one envelope per Gaussian.",
-    )
-    return float(power[0]), float(floor[0])
-
-
 def _make_info(model: VideoModel) -> CompactInfo:
-    power, floor = envelope_of_all(model)
+    power, floor = float(model.splats.envelope.power), float(model.splats.envelope.floor)
     require(
         model.degree <= MAX_DEGREE,
         "model.degree",

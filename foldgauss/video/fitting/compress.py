@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterable
 import numpy as np
 
 from foldgauss._runtime.checks import require
-from foldgauss.video.compression.quantize import dequantize, envelope_of_all
+from foldgauss.video.compression.quantize import dequantize
 from foldgauss.video.fitting.config import DEFAULT_QUALITY, FitConfig, Strategy, Views, planned_steps
 from foldgauss.video.fitting.loop import FitInfo, FitResult, check_frames, fit, start_from
 from foldgauss.video.fitting.rate import COMPRESSION_START, RateControl
@@ -42,17 +42,16 @@ def compress(
 
     Without the clip, nothing makes up for what is dropped and rounded, and there is no `psnr`, nor a budget.
 
-    Raises ValueError for anything but a `VideoModel` (bake edits first), for NaN or infinities, several envelopes, a
+    Raises ValueError for anything but a `VideoModel` (bake edits first), for NaN or infinities, a
     degree above 15, and frames that do not fit.
 
     Example: `save_compact("clip.fgz", compress(model, clip.frames, quality=60).quantized)`.
     """
     check_model(model)
-    power, floor = envelope_of_all(model)
     config = FitConfig(
         degree=model.degree,
-        power=power,
-        floor=floor,
+        power=float(model.splats.envelope.power),
+        floor=float(model.splats.envelope.floor),
         quality=quality,
         size_mb=size_mb,
         psnr=psnr,

@@ -2,7 +2,7 @@
 
 The fold equation is defined by `FoldedGaussian.condition_time` and repeated here for speed: these kernels touch only
 the Gaussians alive, whose number changes with every frame, unlike XLA's fixed shapes. A test checks that values and
-gradients agree. Only polynomial folds, shared paths and the time-likelihood envelope are supported.
+gradients agree. Folds, shared paths and the envelope are those that `FoldedSplats` has.
 """
 
 import collections
@@ -18,7 +18,6 @@ from foldgauss._numerics.simd import LANES, broadcast, cos_and_sin, exp, load, s
 from foldgauss._runtime.checks import require
 from foldgauss._runtime.kernels import inline, kernel
 from foldgauss._runtime.threads import run_tasks
-from foldgauss.envelope import TimeLikelihood
 from foldgauss.render import Splats2D, pixels_per_unit
 from foldgauss.render.splats import check_size
 from foldgauss.video.models.renderer import PreparedVideo
@@ -30,7 +29,7 @@ from foldgauss.video.models.shared_paths import (
     invert_maps,
     to_pixel_maps,
 )
-from foldgauss.video.models.splats import SH_C0, TAU_MAX
+from foldgauss.video.models.splats import SH_C0, TAU_MAX, FoldedSplats
 
 CHUNK = 4096  # Gaussians per task
 
@@ -411,6 +410,18 @@ def backpropagate(
     return float(by_time.sum())
 
 
+def check_renderable(splats: FoldedSplats, num_broken: int) -> None:
+    """Raise ValueError if any Gaussian has NaN or infinities, and for paths as `check_paths`."""
+    require(
+        not num_broken,
+        "model",
+        expected="finite numbers",
+        got=f"others in {num_broken:,} Gaussians",
+        cure="The fit diverged, or the model was edited: fit again.",
+    )
+    check_paths(splats)
+
+
 class PreparedModel(PreparedVideo):
     """The Gaussians of a `VideoModel`, ready to be conditioned on any time, in pixels of an image of `size`.
 
@@ -419,26 +430,19 @@ class PreparedModel(PreparedVideo):
     **Example:** `PreparedModel(model, (160, 320)).splats(0.5)`.
 
     **Source:** VeGaS eq:vegas_equiv_cond. **Raises:** ValueError for an invalid size, and for a model with NaN or
-    infinities or with several envelopes.
+    infinities.
     """
 
     def __init__(self, model: Any, size: tuple[int, int], *, aspect: float | None = None):
         check_size(size)
         height, width = model.size
         self.rows = pack(model.splats)
-        broken = int((~np.isfinite(self.rows)).any(-1).sum())
-        require(
-            not broken,
-            "model",
-            expected="finite numbers",
-            got=f"others in {broken:,} Gaussians",
-            cure="The fit diverged, or the model was edited: fit again.",
-        )
-        power, floor = (_common_value(model.splats.envelope, name) for name in ("power", "floor"))
+        check_renderable(model.splats, int((~np.isfinite(self.rows)).any(-1).sum()))
         aspect = height / width if aspect is None else aspect
-        check_paths(model.splats)
         paths = jax.tree.map(np.asarray, model.splats.paths)
         own = {"aspect": aspect, "paths": paths, "scale_cutoff": model.scale_cutoff}
+        envelope = model.splats.envelope
+        power, floor = float(envelope.power), float(envelope.floor)
         self.spec = ConditioningSpec(model.splats.degree, power, floor, tuple(size), **own)
         self.window = find_windows(self.rows, self.spec)
         self.times = np.asarray(model.frame_times.times())
@@ -451,16 +455,3 @@ class PreparedModel(PreparedVideo):
         """The splats of the Gaussians alive at time t, front to back; NumPy leaves."""
         done = self.at(t)
         return Splats2D(done.mean, done.factor, done.opacity, done.color)
-
-
-def _common_value(envelope: TimeLikelihood, name: str) -> float:
-    """The value that all Gaussians have in common."""
-    values = np.unique(np.asarray(getattr(envelope, name)))
-    require(
-        values.size == 1,
-        f"model.splats.envelope.{name}",
-        expected="one number for all Gaussians",
-        got=f"{values.size} different ones",
-        cure="Use VideoModel.render, which supports one envelope per Gaussian.",
-    )
-    return float(values[0])

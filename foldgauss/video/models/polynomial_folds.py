@@ -103,8 +103,8 @@ def _sample_places(
     t = np.concatenate([np.broadcast_to(frames, (len(which), len(frames))), own], 1)
     u = time_loc[:, None] - t
     tau = u / time_scale[:, None]
-    power, floor = (np.broadcast_to(getattr(splats.envelope, name), len(splats.loc)) for name in ("power", "floor"))
-    envelope = floor[which, None] + (1 - floor[which, None]) * np.exp(-0.5 * power[which, None] * tau**2)
+    power, floor = float(splats.envelope.power), float(splats.envelope.floor)
+    envelope = floor + (1 - floor) * np.exp(-0.5 * power * tau**2)
     weight = np.where((t >= ends[0][:, None]) & (t <= ends[1][:, None]), envelope, 0)
     place = np.broadcast_to(splats.loc[which, None].astype(np.float64), (*u.shape, 2))
     fold = sum(splats.coefficients[which, k, None] * u[..., None] ** (k + 1) for k in range(splats.degree))

@@ -167,7 +167,7 @@ class VideoRenderer:
     **Example:** `for image in VideoRenderer(model).frames(): ...`
 
     **Source:** VeGaS eq:vegas_equiv_cond. **Raises:** ValueError for an invalid size, and for a model with NaN or
-    infinities or with several envelopes.
+    infinities.
     """
 
     def __init__(

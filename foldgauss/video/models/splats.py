@@ -44,9 +44,11 @@ class FoldedSplats(eqx.Module):
     | `color_dc` | (num, 3) | 0.5 + 0.282 color_dc, not below 0 |
     | `path_index` | (num,) or None | the path that moves the Gaussian, from 1; 0 for none |
 
-    `paths`: the motion that Gaussians share, by which those on a path are moved in addition; None without `path_index`.
+    `envelope`: that of all Gaussians, with one power and one floor. `paths`: the motion that Gaussians share, by which
+    those on a path are moved in addition; None without `path_index`.
 
-    Source: VeGaS eq:vegas_equiv and "Implementation Details"; array order is depth order.
+    Source: VeGaS eq:vegas_equiv and "Implementation Details"; array order is depth order. Raises ValueError for an
+    envelope with several powers or floors.
     """
 
     loc: Float[Array, "num 2"]
@@ -60,6 +62,17 @@ class FoldedSplats(eqx.Module):
     envelope: TimeLikelihood
     path_index: UInt8[Array, " num"] | None = None
     paths: SharedPaths | None = None
+
+    def __check_init__(self):
+        for name in ("power", "floor"):
+            shape = jnp.shape(getattr(self.envelope, name))
+            require(
+                not shape,
+                f"envelope.{name}",
+                expected="one number for all Gaussians",
+                got=f"shape {shape}",
+                cure="Give each envelope a video of its own, and stack these by layers().",
+            )
 
     @property
     def num_gaussians(self) -> int:
@@ -77,11 +90,10 @@ class FoldedSplats(eqx.Module):
 
     def take(self, which: Bool[np.ndarray, " num"] | Int[np.ndarray, " num_new"]) -> "FoldedSplats":
         """The Gaussians of a mask or at these indices, in their order; all paths stay. Indices may repeat."""
-        num = self.num_gaussians
 
-        def index(leaf: Array) -> Array:  # an envelope may have one parameter for all Gaussians
+        def index(leaf: Array) -> Array:
             # Not `jnp.asarray`, which compiles a program for each number of Gaussians.
-            return jax.device_put(np.asarray(leaf)[which]) if np.shape(leaf)[:1] == (num,) else leaf
+            return jax.device_put(np.asarray(leaf)[which]) if np.ndim(leaf) else leaf  # of the envelope
 
         return dataclasses.replace(jax.tree.map(index, dataclasses.replace(self, paths=None)), paths=self.paths)
 
@@ -136,7 +148,8 @@ class FoldedSplats(eqx.Module):
         shared paths. To render the density itself, use `density_image`.
 
         Shapes: `mixture` of (x, y, t) without batch dimensions, in model space, m_t in (0, 1), with polynomial or zero
-        folds and a time-likelihood or constant envelope; `color` (3,) or (num, 3), not below 0.
+        folds and one time-likelihood or constant envelope; `color` (3,) or (num, 3), not below 0. Within `jax.jit` or
+        `jax.grad` the envelope is that of the first component.
         Raises ValueError for any other mixture or color.
 
         Example: `FoldedSplats.from_mixture(mixture, color=[1.0, 0.5, 0.0]).at(0.5)`.
@@ -185,7 +198,7 @@ class FoldedSplats(eqx.Module):
             coefficients=jnp.zeros((num, 0, 2), dtype) if isinstance(fold, ZeroFold) else fold.coefficients,
             opacity_logit=log_opacity - jnp.log(-jnp.expm1(log_opacity)),
             color_dc=(_check_color(color, num, dtype) - 0.5) / SH_C0,
-            envelope=TimeLikelihood(power=0.0) if isinstance(envelope, Constant) else envelope,
+            envelope=TimeLikelihood(0.0) if isinstance(envelope, Constant) else jax.tree.map(_common_value, envelope),
         )
 
     def to_mixture(self) -> FoldedMixture:
@@ -233,6 +246,12 @@ def find_axes(tril: Float[Array, "num 2 2"]) -> tuple[Float[Array, "num 2"], Flo
     twice_cross, difference = 2 * p * q, (p - r) * (p + r) - q * q
     isotropic = (twice_cross == 0) & (difference == 0)  # any angle is right, and has no meaningful gradient
     return log_scale, jnp.pi + 0.5 * jnp.arctan2(twice_cross, jnp.where(isotropic, 1, difference))
+
+
+def _common_value(leaf: Array) -> Array:
+    """The first value, unless others are known to differ: then the array."""
+    values = concrete_value(leaf)
+    return leaf if values is not None and (values != values.flat[0]).any() else leaf.ravel()[0]
 
 
 def _check_color(color: ArrayLike, num: int, dtype) -> Float[Array, "num 3"]:

@@ -3,6 +3,7 @@
 import dataclasses
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
@@ -10,7 +11,7 @@ from foldgauss._runtime.checks import require
 from foldgauss.render import RenderOptions, Splats2D, render
 from foldgauss.render.splats import check_size
 from foldgauss.video.models.background import BLACK, Background, check_background
-from foldgauss.video.models.conditioning import PreparedModel
+from foldgauss.video.models.conditioning import PreparedModel, check_renderable
 from foldgauss.video.models.frame_times import FrameTimes, snap_to_shots
 from foldgauss.video.models.renderer import RenderedVideo, choose_time
 from foldgauss.video.models.splats import FoldedSplats
@@ -113,13 +114,16 @@ class VideoModel(RenderedVideo, eqx.Module):
           interpolated; the last frame is shown to the end.
 
         Raises TypeError unless exactly one is given, IndexError for a frame that the clip does not have, and ValueError
-        for another time, seconds or size. Example: `model.render(frame=-1)`.
+        for another time, seconds or size, and, outside of `jax.jit` and `jax.grad`, for a model with NaN or infinities.
+        Example: `model.render(frame=-1)`.
         """
         size = self.size if size is None else size
         check_size(size)
         t = choose_time(self, time, frame, seconds)
         t = snap_to_shots(jnp.asarray(t, jnp.float32), self.frame_times.times())
-        splats = _splats_in_pixels(self, t, tuple(size))
+        splats, num_broken = _splats_in_pixels(self, t, tuple(size))
+        if not isinstance(num_broken, jax.core.Tracer):
+            check_renderable(self.splats, int(num_broken))
         behind = jnp.asarray(check_background(background, self.compositing), splats.mean.dtype)[:3]
         how = {"engine": engine, "compositing": self.compositing, "options": self.options}
         if background is not None:
@@ -129,5 +133,8 @@ class VideoModel(RenderedVideo, eqx.Module):
 
 
 @eqx.filter_jit
-def _splats_in_pixels(model: VideoModel, t: Float[Array, ""], size: tuple[int, int]) -> Splats2D:
-    return model.at(t, size)
+def _splats_in_pixels(model: VideoModel, t: Float[Array, ""], size: tuple[int, int]) -> tuple[Splats2D, Array]:
+    """The splats, and the number of Gaussians with NaN or infinities."""
+    own = jax.tree.leaves(dataclasses.replace(model.splats, paths=None))
+    finite = [jnp.isfinite(leaf).reshape(model.num_gaussians, -1).all(axis=1) for leaf in own if leaf.ndim]
+    return model.at(t, size), (~jnp.stack(finite).all(axis=0)).sum()

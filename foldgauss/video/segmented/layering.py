@@ -181,9 +181,8 @@ def flatten_video(video: Video) -> VideoModel:
 def _check_alike(layers: tuple[Layer, ...], lead: VideoModel) -> None:
     for layer in layers:
         model = layer.model
-        own, other = (jax.tree.map(lambda leaf: np.unique(leaf).tolist(), one.splats.envelope) for one in (model, lead))
         require(
-            own == other and (len(layers) <= 1 or not any(len(values) > 1 for values in (own.power, own.floor))),
+            jax.tree.leaves(model.splats.envelope) == jax.tree.leaves(lead.splats.envelope),
             "model",
             expected="layers with one envelope",
             got="several",
@@ -211,10 +210,9 @@ def _concatenate(parts: list[FoldedSplats]) -> FoldedSplats:
 
     def pad(part: FoldedSplats) -> FoldedSplats:
         coefficients = jnp.pad(part.coefficients, ((0, 0), (0, degree - part.degree), (0, 0)))
-        return dataclasses.replace(part, coefficients=coefficients, envelope=None, path_index=None, paths=None)
+        return dataclasses.replace(part, coefficients=coefficients, path_index=None, paths=None)
 
     path_index, paths = join_paths(parts)
-    # It has the same values for all Gaussians, see `_check_alike`.
-    envelope = jax.tree.map(lambda leaf: jnp.ravel(leaf)[0], parts[0].envelope)
-    joined = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *map(pad, parts))
-    return dataclasses.replace(joined, envelope=envelope, path_index=path_index, paths=paths)
+    # The numbers of the envelope are those of all parts, see `_check_alike`.
+    joined = jax.tree.map(lambda one, *others: jnp.concatenate([one, *others]) if one.ndim else one, *map(pad, parts))
+    return dataclasses.replace(joined, path_index=path_index, paths=paths)

@@ -27,7 +27,7 @@ class Contributions:
 
     `background`, (3,), is what traces are composited over.
 
-    **Raises:** ValueError for anything but a `VideoModel`, for NaN or infinities, and for several envelopes.
+    **Raises:** ValueError for anything but a `VideoModel`, and for NaN or infinities.
     """
 
     def __init__(self, model: VideoModel, background: Float32[np.ndarray, "3"] = _BLACK):

@@ -14,7 +14,7 @@ export function readSafetensors(buffer) {
   if (about.kind === "edited-video") throw new Error("This is an edited video whose edits no folded model holds. Render it with foldgauss render, or open the model and the edit script.");
   if (about.kind !== "video") throw new Error(`This is a ${JSON.stringify(about.kind)}, not a model. Open the file that foldgauss fit wrote.`);
   const header = JSON.parse(about.header), { num_gaussians: num, degree } = header;
-  const leaf = (name) => tensor(`splats.${name}`), envelope = (name) => oneOf(tensor(`splats.envelope.${name}`), name);
+  const leaf = (name) => tensor(`splats.${name}`), envelope = (name) => tensor(`splats.envelope.${name}`)[0];
   const leaves = {};
   for (const name of ["loc", "log_scale", "angle_logit", "time_loc_logit", "log_time_scale", "coefficients", "opacity_logit", "color_dc"]) leaves[name] = leaf(name);
   leaves.frame_times = tensor("frame_times.logits");
@@ -54,12 +54,6 @@ function readTensors(buffer) {
     return new kind(buffer.slice(start + from, start + to));
   };
   return { about, tensor };
-}
-
-/** The value of an envelope's parameter, which the player has for all Gaussians together. */
-function oneOf(values, name) {
-  if (values.some((own) => own !== values[0])) throw new Error(`The model has several envelopes (${name}), which the page cannot play. Render it with foldgauss render.`);
-  return values[0];
 }
 
 /** A model as a file that foldgauss opens. Throws an Error for display where none can hold it. */
