@@ -59,7 +59,10 @@ def same_states(one, other):
 
 def states_of(frames, config, state=None):
     """A copy of the state after every step, by step."""
-    return {info.step: state.copy() for state, info in fit_steps(frames, config, state)}
+    kept = {info.step: state.copy() for state, info in fit_steps(frames, config, state)}
+    for state in kept.values():
+        state.fetch_all()
+    return kept
 
 
 def model_of(state, config=CONFIG):

@@ -19,8 +19,10 @@ CHECKPOINT = "fit-checkpoint"
 def save_checkpoint(path: PathLike, state: FitState, *, config: FitConfig, source: dict) -> Path:
     """Write a running fit with what it must be resumed with: its settings and its frames.
 
-    The last finite state is omitted if it was taken at the same step, which halves the size of the file.
+    The last finite state is omitted if it was taken at the same step, which halves the size of the file. Arrays are
+    fetched (`FitState.fetch_all`).
     """
+    state.fetch_all()
     if is_known_good(state):
         state = dataclasses.replace(state, last_finite=None)
     return save_model(path, state, metadata={"config": dataclasses.asdict(config), "source": source})

@@ -170,6 +170,7 @@ class Guard:
 
     def _most_moved(self, state: FitState) -> str:
         """The leaf that moved farthest from the last finite state, in units of its spread there."""
+        state.fetch_all()
         before, rows = state.last_finite.rows, state.rows
         if before.shape != rows.shape:
             return "some leaves"
@@ -206,8 +207,8 @@ def _time_move(state: FitState) -> float:
 
 def _find_nonfinite(state: FitState, config: FitConfig) -> str:
     """The leaves with NaN or infinities, and how many Gaussians have them; empty if there are none."""
-    found = []
-    rows = state.rows
+    state.fetch_all()
+    found, rows = [], state.rows
     for name, at in columns(config.fold_degree).items():
         bad = np.flatnonzero(~np.isfinite(rows[:, at]).all(1))
         if len(bad):

@@ -30,6 +30,7 @@ from foldgauss.video.fitting.initialize import (
 )
 from foldgauss.video.fitting.rate import RateControl, count_bytes, count_past
 from foldgauss.video.fitting.relocation import Relocation, relocates
+from foldgauss.video.fitting.schedule import steps_per_pass
 from foldgauss.video.fitting.state import FitState, StepResult, envelope_of, running_psnr, to_model
 from foldgauss.video.fitting.steppers.engines import choose_engine, make_stepper
 from foldgauss.video.models.frame_times import FrameTimes, check_rate, make_time_logits
@@ -158,17 +159,18 @@ def fit_steps(
     _warm_up(frames, config, engine)
     find_motion = motion_finder(frames, motion)
     state = start(frames, config, find_motion, clock) if state is None else state
-    stepper = make_stepper(engine, frames, config, state, find_motion)
     planner, time_left = StepPlanner(config), TimeLeft(state, config)
-    guard = Guard(state, config, stepper.steps_per_pass, alpha=has_alpha)
+    guard = Guard(state, config, steps_per_pass(config, len(frames)), alpha=has_alpha)
     controls = [*_make_controls(frames, config, state, find_motion), *controls]
+    stopped_by = find_limit(state, config)
+    if stopped_by:  # a resumed state that needs no more steps
+        yield state, _make_info(state, config, time_left, StepResult(math.nan, 0), stopped_by)
+        return
+    stepper = make_stepper(engine, frames, config, state, find_motion)
     if state.step == 0 and guard.comparable and config.initialization != "uniform":
         begun = clock()
         state.start_errors = tuple(stepper.measure_start(state).items())
         state.seconds += clock() - begun
-    stopped_by = find_limit(state, config)
-    if stopped_by:  # a resumed state that needs no more steps
-        yield state, _make_info(state, config, time_left, StepResult(math.nan, 0), stopped_by)
     while not stopped_by:
         begun = clock()
         result = stepper.step(state, measure_progress(state, config))
@@ -195,6 +197,7 @@ def fit_steps(
         stopped_by = find_limit(state, config)
         if stopped_by:
             guard.finish(state)
+            state.fetch_all()
         state.seconds += clock() - begun
         yield state, _make_info(state, config, time_left, result, stopped_by)
 

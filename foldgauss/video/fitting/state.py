@@ -118,12 +118,13 @@ class GradientStatistics(NamedTuple):
 
 
 @jax.tree_util.register_dataclass
-@dataclasses.dataclass
+@dataclasses.dataclass(repr=False)
 class FitState:
     """The arrays and counters of a running fit. A step consumes its state: arrays are updated in place.
 
-    The arrays of a fit on a device are `held` there, and fetched, as copies, whenever they are read; an array that is
-    assigned is used from the next step on.
+    The arrays of a fit on a device are `held` there until `fetch_all`: reading another one than those that every step
+    fetches (`frame_errors`, `time_logits`, `path_maps`) raises AttributeError. An array that is assigned is used from
+    the next step on.
     """
 
     rows: np.ndarray = field(metadata=_array(np.float32, "num_gaussians", "width"))  # parameters, see `row_layout`
@@ -188,12 +189,12 @@ class FitState:
         arrays = {name: kind.build(sizes) for name, kind in cls.array_fields().items() if name not in fields}
         return cls(**arrays, **fields)
 
+    def __repr__(self) -> str:
+        return f"{type(self).__name__}(step {self.step}, {self.num_gaussians} Gaussians)"
+
     def __getattr__(self, name: str) -> Any:
-        """An array that is held elsewhere is fetched."""
-        held = self.__dict__.get("held")
-        if held is None or name not in ARRAYS:
-            raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}")
-        return held.fetch(name)
+        cure = f" on the host: call fetch_all() of the {type(self).__name__} first" if name in ARRAYS else ""
+        raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}{cure}", name=name, obj=self)
 
     @property
     def num_gaussians(self) -> int:
@@ -218,9 +219,12 @@ class FitState:
         return self.rows[:, columns((self.rows.shape[1] - columns(0)["coefficients"].stop) // 2)[name]]
 
     def is_finite(self, name: str) -> bool:
-        """Whether all values of an array are finite, by their sum: a third of the time of testing each."""
-        if self.held is not None:
-            return self.held.is_finite(name)
+        """Whether all values of an array are finite, by their sum: a third of the time of testing each.
+
+        Of those held on a device, this is known of `rows` and `second`.
+        """
+        if name not in self.__dict__:
+            return self.held.finite[name]
         with np.errstate(invalid="ignore", over="ignore"):
             return bool(np.isfinite(getattr(self, name).sum()))
 
@@ -254,8 +258,8 @@ class FitState:
 
     def restore(self) -> None:
         """Take the arrays of `last_finite` back, as copies."""
-        self.held = None
-        for name in self.array_fields():
+        self.fetch_all()
+        for name in ARRAYS:
             setattr(self, name, np.array(getattr(self.last_finite, name)))
 
     def hold(self, held: Any) -> None:
@@ -263,18 +267,25 @@ class FitState:
         for name in ARRAYS:
             self.__dict__.pop(name, None)
         self.held = held
+        self.__dict__.update(held.on_host)
 
     def fetch_all(self) -> None:
-        """Fetch all arrays that were not assigned meanwhile, and hold none any more."""
+        """Fetch all arrays that were not assigned meanwhile, and those of `last_finite`: none is held any more.
+
+        The next step sends them to the device again. Without a device there is nothing to do.
+        """
         if self.held is not None:
-            arrays = {name: getattr(self, name) for name in ARRAYS}
+            arrays = {name: self.held.fetch(name) for name in ARRAYS if name not in self.__dict__}
             self.held = None
             self.__dict__.update(arrays)
+        if self.last_finite is not None:
+            self.last_finite.fetch_all()
 
     @property
     def changed(self) -> bool:
         """Whether an array was assigned since arrays are held."""
-        return self.held is not None and not self.__dict__.keys().isdisjoint(ARRAYS)
+        own, held = self.__dict__, self.held
+        return held is not None and any(own.get(name) is not held.on_host.get(name) for name in ARRAYS)
 
 
 #: The names of the arrays of a `FitState`.
@@ -295,7 +306,8 @@ class StepResult(NamedTuple):
 
 
 def to_model(state: FitState, config: FitConfig, size: tuple[int, int], fps: float) -> VideoModel:
-    """The model as it stands in `state` (arrays are copied)."""
+    """The model as it stands in `state`, whose arrays are fetched (`FitState.fetch_all`) and copied."""
+    state.fetch_all()
     return VideoModel(
         splats=unpack(state.rows, config.fold_degree, envelope_of(config), paths_of(state)),
         frame_times=FrameTimes(state.time_logits.copy()),
@@ -345,7 +357,8 @@ def spec_of(config: FitConfig, size: tuple[int, int]) -> ConditioningSpec:
     return ConditioningSpec(config.fold_degree, config.power, config.floor, tuple(size), scale_cutoff=cutoff)
 
 
-def envelope_of(config: FitConfig) -> TimeLikelihood:
+def envelope_of(config: Any) -> TimeLikelihood:
+    """That of settings, or of all that has `power` and `floor`."""
     return TimeLikelihood(power=np.float32(config.power), floor=np.float32(config.floor))
 
 

@@ -441,8 +441,7 @@ class PreparedModel(PreparedVideo):
         aspect = height / width if aspect is None else aspect
         paths = jax.tree.map(np.asarray, model.splats.paths)
         own = {"aspect": aspect, "paths": paths, "scale_cutoff": model.scale_cutoff}
-        envelope = model.splats.envelope
-        power, floor = float(envelope.power), float(envelope.floor)
+        power, floor = float(model.splats.envelope.power), float(model.splats.envelope.floor)
         self.spec = ConditioningSpec(model.splats.degree, power, floor, tuple(size), **own)
         self.window = find_windows(self.rows, self.spec)
         self.times = np.asarray(model.frame_times.times())

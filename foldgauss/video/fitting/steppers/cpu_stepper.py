@@ -13,7 +13,6 @@ from foldgauss.video.fitting.losses import LOSSES
 from foldgauss.video.fitting.schedule import (
     choose_start_frames,
     learning_rates,
-    steps_per_pass,
     to_planes,
 )
 from foldgauss.video.fitting.state import (
@@ -53,7 +52,6 @@ class CpuStepper:
         self.frames, self.config = frames, config
         self.background = np.zeros(3, np.float32)  # for frames with alpha another one in every step
         self.num_frames = len(frames)
-        self.steps_per_pass = steps_per_pass(config, self.num_frames)
         self.spec = spec_of(config, frames.shape[1:3])
         self.interpolation = make_interpolated(frames, config, find_motion or motion_finder(frames))
         self.adopt(state)

@@ -15,7 +15,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, UInt8
 
-from foldgauss.envelope import TimeLikelihood
 from foldgauss.render import RenderOptions, Splats2D, render
 from foldgauss.render.tiles import find_visible
 from foldgauss.video.fitting.adam import masked_adam, update_frame_times, update_paths
@@ -26,6 +25,7 @@ from foldgauss.video.fitting.state import (
     DeviceArrays,
     FitState,
     Sizes,
+    envelope_of,
     frame_times,
     measure_relative_size,
 )
@@ -64,6 +64,7 @@ class Report(NamedTuple):
     finite_second: Bool[Array, ""]
     frame_errors: Float[Array, " num_frames"]
     time_logits: Float[Array, " intervals"]
+    path_maps: Float[Array, "num_frames paths 2 3"]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -173,6 +174,7 @@ def step(program: Program, arrays: DeviceArrays, frames: UInt8[Array, "frames he
         finite_second=jnp.all(jnp.isfinite(second)),
         frame_errors=errors,
         time_logits=logits,
+        path_maps=arrays.path_maps,
     )
     arrays = arrays._replace(rows=rows, first=first, second=second, counts=counts, frame_errors=errors)
     count, first, second = of_times
@@ -240,20 +242,16 @@ def find_alive(program: Program, rows, num, t) -> Bool[Array, " capacity"]:
     alive = (jnp.arange(program.capacity, dtype=jnp.int32) < num) & (center - reach < t) & (t < center + reach)
     if program.scale_cutoff > 0:
         spread = jnp.exp(rows[:, place["log_time_scale"].start])
-        log_a = _envelope(program).log_a(t, time_loc=center, time_scale=spread)
+        log_a = envelope_of(program).log_a(t, time_loc=center, time_scale=spread)
         alive &= rows[:, place["log_scale"]].min(axis=1) + log_a / 2 > math.log(program.scale_cutoff)
     return alive
-
-
-def _envelope(program: Program) -> TimeLikelihood:
-    return TimeLikelihood(power=np.float32(program.power), floor=np.float32(program.floor))
 
 
 def _splats(program: Program, rows, maps, t, alive, mirrored) -> Splats2D:
     """The Gaussians at time t in pixels, by `FoldedSplats.at`; those not alive have opacity 0."""
     # The rows of those are replaced, so that their underflow far away in time is in no gradient.
     rows = jnp.where(alive[:, None], rows, jnp.zeros_like(rows))
-    splats = unpack(rows, program.degree, _envelope(program)).at(t)
+    splats = unpack(rows, program.degree, envelope_of(program)).at(t)
     if program.num_paths:
         splats = move_splats(splats, rows[:, -1].astype(jnp.int32), maps)
     splats = splats.to_pixels(program.size)

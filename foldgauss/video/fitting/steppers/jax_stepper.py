@@ -1,7 +1,7 @@
 """`JaxStepper`: the steps of a fit on JAX's default device, where arrays and frames stay between steps.
 
-After each step only `jax_step.Report` is fetched, some hundred numbers. Arrays are fetched where they are read from the
-state, and for densification and relocation, which run on the host.
+After each step only `jax_step.Report` is fetched, some hundred numbers. All arrays are fetched by `FitState.fetch_all`
+alone: for controls, such as densification and relocation, which run on the host, for checkpoints and for models.
 """
 
 import math
@@ -16,7 +16,6 @@ from foldgauss.video.fitting.schedule import (
     choose_start_frames,
     find_views_in_turn,
     learning_rates,
-    steps_per_pass,
 )
 from foldgauss.video.fitting.state import STATISTICS, DeviceArrays, FitState, StepResult, frame_times
 from foldgauss.video.fitting.steppers.interpolated_frames import Prefetcher, choose_targets, make_interpolated
@@ -24,7 +23,6 @@ from foldgauss.video.fitting.steppers.jax_step import (
     Control,
     InterpolatedViews,
     Program,
-    Report,
     array_specs,
     compile_error,
     compile_step,
@@ -38,34 +36,39 @@ CAPACITY_FACTOR = 2
 CAPACITY_STEPS = 4
 #: Interpolated frames are prepared so many steps ahead: one takes some tenths of a second, a step on a GPU some ms.
 STEPS_AHEAD = 64
+#: Arrays of a state that every step fetches: they are small, and it is by them that a fit is watched.
+ON_HOST = ("frame_errors", "time_logits", "path_maps")
 _FIELDS = FitState.array_fields()
 
 
 class HeldArrays:
-    """The arrays of a `FitState` on a device, fetched only where they are read. The next step consumes them."""
+    """The arrays of a `FitState` on a device. The next step consumes them.
 
-    def __init__(self, arrays: DeviceArrays, num: int, growing: bool, report: Report | None):
-        self.arrays, self.num, self.growing, self.report = arrays, num, growing, report
+    `on_host`: those of `ON_HOST`, fetched. `finite`: of `rows` and `second`, whether all values are.
+    """
+
+    def __init__(
+        self,
+        arrays: DeviceArrays,
+        num: int,
+        growing: bool,
+        on_host: dict[str, np.ndarray],
+        finite: dict[str, bool],
+    ):
+        self.arrays, self.num, self.growing, self.on_host, self.finite = arrays, num, growing, on_host, finite
 
     def fetch(self, name: str) -> np.ndarray:
         """A field of `FitState`, a copy."""
-        if self.report is not None and name in Report._fields:
-            return np.array(getattr(self.report, name))
         array = np.array(getattr(self.arrays, name))
         if name in STATISTICS:
             return array[: self.num if self.growing else 0].copy()
         return array[: self.num].copy() if _FIELDS[name].per_gaussian else array
 
-    def is_finite(self, name: str) -> bool:
-        """Whether all values of a field are finite, as computed on the device."""
-        if self.report is not None and name in ("rows", "second"):
-            return bool(getattr(self.report, f"finite_{name}"))
-        return bool(np.isfinite(self.fetch(name)).all())
-
     def copy(self) -> "HeldArrays":
         """A copy on the device, which later steps do not change."""
-        arrays = jax.tree.map(lambda leaf: leaf.copy(), self.arrays)
-        return HeldArrays(arrays, self.num, self.growing, self.report)
+        return HeldArrays(
+            jax.tree.map(lambda leaf: leaf.copy(), self.arrays), self.num, self.growing, self.on_host, self.finite
+        )
 
 
 class JaxStepper:
@@ -85,7 +88,6 @@ class JaxStepper:
         self.frames, self.config, self.engine = frames, config, engine
         self.num_frames, *size = frames.shape[:3]
         self.size = tuple(size)
-        self.steps_per_pass = steps_per_pass(config, self.num_frames)
         self.interpolation = make_interpolated(frames, config, find_motion or motion_finder(frames))
         self.prefetcher = None if self.interpolation is None else Prefetcher(self.interpolation)
         self._prepared = 0  # steps
@@ -110,10 +112,17 @@ class JaxStepper:
         arrays = DeviceArrays(*(_pad(getattr(state, name), spec) for name, spec in specs.items()))
         # Copied, since arrays that are donated must be the device's own.
         arrays = jax.tree.map(lambda leaf: leaf.copy(), jax.device_put(arrays))
-        state.hold(HeldArrays(arrays, num, state.growing, None))
+        held = HeldArrays(
+            arrays,
+            num,
+            state.growing,
+            on_host={name: getattr(state, name) for name in ON_HOST},
+            finite={name: state.is_finite(name) for name in ("rows", "second")},
+        )
+        state.hold(held)
 
     def step(self, state: FitState, progress: float) -> StepResult:
-        if state.changed:  # by an observer of the fit
+        if state.held is None or state.changed:  # by an observer of the fit
             state.fetch_all()
             self.adopt(state)
         held, config = state.held, self.config
@@ -131,8 +140,15 @@ class JaxStepper:
         self._prepare(state, progress)
         arrays, report = compile_step(self.program)(held.arrays, self.images, control)
         report = jax.device_get(report)
-        state.hold(HeldArrays(arrays, held.num, state.growing, report))
-        return StepResult(float(report.loss), int(report.num_alive), state.is_finite("rows"))
+        held = HeldArrays(
+            arrays,
+            held.num,
+            state.growing,
+            on_host={name: np.array(getattr(report, name)) for name in ON_HOST},
+            finite={"rows": bool(report.finite_rows), "second": bool(report.finite_second)},
+        )
+        state.hold(held)
+        return StepResult(float(report.loss), int(report.num_alive), held.finite["rows"])
 
     def _interpolate(self, views: np.ndarray, chosen: list[float | None], step: int) -> InterpolatedViews | None:
         """The interpolated targets of a step; None if the fit has none at all."""
