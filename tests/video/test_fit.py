@@ -105,7 +105,7 @@ def test_borders_of_a_pan():
     picture = np.uint8(np.round(255 * image))
     frames, dark = np.stack([picture[60:108, 40 + 4 * k : 104 + 4 * k] for k in range(12)]), {}
     for weight in (1.0, FitConfig().loss.border_weight):
-        model = fit(frames, FitConfig(num_gaussians=900, steps=240, loss=Loss(border_weight=weight))).model
+        model = fit(frames, FitConfig(num_gaussians=900, steps=120, loss=Loss(border_weight=weight))).model
         ends = np.stack(list(model.frames()))[[0, -1]].astype(float) - frames[[0, -1]]
         dark[weight] = -ends[:, border_weights(48, 64, 2.0) == 2].mean()
     assert dark[1.0] > 0.5  # levels
