@@ -93,7 +93,7 @@ def fit(
 
     `fps`: frames per second. `state`: what to start from, see `start_from`. `controls` change the Gaussians between
     steps, after those of the settings: see `DensityControl`. `observers` are called with (state, info) after every
-    step: progress bars, checkpoints.
+    step: progress bars, checkpoints. With an engine of JAX, `state.fetch_all()` brings the arrays of the state first.
     `every`: the history keeps every so many steps, and the last. Raises ValueError for frames or settings that cannot
     be fitted. A fit that diverges warns by `DivergenceWarning` and goes on from its last finite state with lower
     learning rates; it raises `FitDiverged` where that does not help. No budget includes the compilation of kernels,
