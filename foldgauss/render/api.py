@@ -100,8 +100,6 @@ def render(
     require(background.shape == (channels,), "background", expected=f"shape ({channels},)", got=background.shape)
     if engine == "auto":
         engine = choose_engine(options, dtype)
-    if engine == "cpu":
-        cpu.check_options(options)
     if engine == "pallas":
         pallas.check_options(options)
     # Engine "xla" is not compiled here: it sizes its lists by concrete values where it can.
@@ -137,7 +135,7 @@ def render(
 
 def choose_engine(options: RenderOptions, dtype: np.dtype) -> str:
     """The engine that "auto" stands for, by the options and the dtype of the splats."""
-    if default_platform() == "cpu" and options.tile_size in (None, cpu.TILE):
+    if default_platform() == "cpu":
         return "cpu"
     return "pallas" if dtype == jnp.float32 and pallas.is_preferred(options) else "xla"
 

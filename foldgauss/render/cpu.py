@@ -53,17 +53,6 @@ class Trace:
     constants: tuple  # background, over, ceiling, stop
 
 
-def check_options(options: RenderOptions) -> None:
-    """Raise ValueError for options that this engine does not support."""
-    require(
-        options.tile_size in (None, TILE),
-        "options.tile_size",
-        expected=f"None or {TILE} for engine 'cpu'",
-        got=options.tile_size,
-        cure="engine='xla' supports other sizes.",
-    )
-
-
 def forward(
     mean: np.ndarray,
     factor: np.ndarray,
@@ -79,10 +68,9 @@ def forward(
 
     Returns the trace: its `image` is planar, (channels, height, width).
     A splat with a parameter that is not finite is left out and gets no gradient. One kernel is compiled for each
-    number of channels, from 1 to 4. Raises ValueError for a tile size other than this
-    engine's, a size below 1, and arrays that are not float32 or whose shapes do not match.
+    number of channels, from 1 to 4. Tiles have `TILE` pixels, whatever `options.tile_size`. Raises
+    ValueError for a size below 1, and arrays that are not float32 or whose shapes do not match.
     """
-    check_options(options)
     check_size(size)
     _check_leaves(mean, factor, opacity, color, background)
     mean, factor, opacity, color, background = map(_read_only, (mean, factor, opacity, color, background))

@@ -2,7 +2,7 @@
 
 import dataclasses
 import math
-from numbers import Integral, Real
+from numbers import Real
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -87,7 +87,7 @@ def check_size(size: tuple[int, int]) -> None:
     """Raise unless `size` is an image's (height, width)."""
     pair = isinstance(size, (tuple, list)) and len(size) == 2
     require(
-        pair and all(isinstance(n, Integral) and n >= 1 for n in size),
+        pair and all(is_integer(n, 1) for n in size),
         "size",
         expected="(height, width), both whole and >= 1",
         got=size,
@@ -139,7 +139,8 @@ class RenderOptions:
     #: A splat is dropped beyond this many standard deviations. None: where the cutoff drops it anyway (3.3 deviations
     #: for opacity 1 and 1/255). The published rasterizer applies 3 to its tiles' lists, not to its pixels.
     support_radius: float | None = None
-    #: Side of the square tiles of the splats' lists, in px: speed only. None: the engine's fastest.
+    #: Side of the square tiles of the splats' lists in engines "xla" and "pallas", in px: speed only. None: the
+    #: engine's fastest.
     tile_size: int | None = None
     #: Capacity for (tile, splat) pairs in engines "xla" and "pallas": memory and speed only, since splats beyond it are
     #: rendered in further rounds. At least the number of tiles; None: counted where the splats are concrete, else

@@ -133,16 +133,10 @@ def _late(model):
     return edit(model).select(OBJECT).move((0.1, 0.0), times=(0.5, 1.0)).video()
 
 
-def _two_envelopes(model):
-    power = jnp.linspace(1.0, 2.0, NUM, dtype=jnp.float32)
-    return eqx.tree_at(lambda m: m.splats.envelope, model, TimeLikelihood(power, jnp.zeros(NUM, jnp.float32)))
-
-
 @pytest.mark.parametrize(
     ("what", "message"),
     [
         (lambda m: html_page(_late(m)), "edits that no folded model represents.*foldgauss render"),
-        (lambda m: html_page(_two_envelopes(m)), "envelope: expected one for all"),
         (
             lambda m: html_page(SegmentedVideo.from_models([(0, m), (5, _late(m))])),
             "segment 1: .*edits that no folded model represents",

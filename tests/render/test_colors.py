@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scenes import draw, scene
 
-from foldgauss.render import RenderOptions, Splats2D, render, solve_colors
+from foldgauss.render import Splats2D, render, solve_colors
 
 BACKGROUND = jnp.asarray([0.2, 0.4, 0.6])
 
@@ -85,7 +85,6 @@ def test_invisible_splats_keep_their_colors():
             r"^splats.color: expected finite numbers, got 1 ",
         ),
         ({"ridge": -1.0}, "ridge"),
-        ({"options": RenderOptions(tile_size=8), "engine": "cpu"}, "tile_size"),
     ],
 )
 def test_invalid_arguments_raise(change, message):

@@ -267,7 +267,6 @@ def forward(changed=None, wrong=None, size=(16, 16), **how):
 
 ARRAYS = "mean, factor, opacity, color, background"
 WRONG = [
-    (lambda: forward(options=RenderOptions(tile_size=8)), r"options.tile_size.*other sizes"),
     (lambda: forward(size=(0, 10)), "size"),
     (lambda: forward(3, lambda leaf: leaf[:, :0]), r"color, background: expected .* 1 to 4 channels"),
     (lambda: forward(3, lambda leaf: leaf[:, :2]), r"color, background: expected .* 1 to 4 channels"),

@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from path_models import moving_splats, random_paths, random_splats
+from path_models import moving_splats, path_model, random_paths, random_splats
 
 from foldgauss._runtime.threads import run_tasks
 from foldgauss.envelope import TimeLikelihood
@@ -214,6 +214,12 @@ def test_splats_have_one_envelope(name, shape):
     """Whichever way they are rendered."""
     with pytest.raises(ValueError, match=rf"^envelope\.{name}: expected one number for all Gaussians, .*layers"):
         dataclasses.replace(random_splats(), envelope=TimeLikelihood(**{name: np.full(shape, 0.5, np.float32)}))
+
+
+@pytest.mark.parametrize("missing", ["paths", "path_index"])
+def test_splats_have_paths_and_their_index_or_neither(missing):
+    with pytest.raises(ValueError, match=r"^path_index: expected one where there are paths"):
+        dataclasses.replace(path_model().splats, **{missing: None})
 
 
 @pytest.mark.parametrize("degree", [0, 3])

@@ -1,7 +1,8 @@
 """`VideoRenderer` renders the same images as the slow path."""
 
+import dataclasses
+
 import equinox as eqx
-import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -59,13 +60,53 @@ def test_bytes_are_rounded_and_clipped():
     np.testing.assert_array_equal(to_bytes(np.ascontiguousarray(image))[1, :, 0], [0, 0, 0, 1, 255, 255, 255])
 
 
-def test_invalid_models_and_sizes_are_rejected():
+ENTRANCES = {
+    "render": lambda model, t=0.5, size=None: np.asarray(model.render(t, size)),
+    "frames": lambda model, t=0.5, size=None: next(model.frames([t], size)) / 255,
+    "renderer": lambda model, t=0.5, size=None: next(VideoRenderer(model, size).frames([t])) / 255,
+}
+
+
+def _without_gaussians(model):
+    return dataclasses.replace(model, splats=model.splats.take(np.zeros(0, int)))
+
+
+@pytest.mark.parametrize("entrance", ENTRANCES)
+@pytest.mark.parametrize(
+    ("change", "how", "message"),
+    [
+        *((None, {"size": size}, r"^size: expected \(height, width\)") for size in ((0, 5), (5.5, 5), (True, 5), 5)),
+        *(
+            (None, {"t": t}, "^times?: expected (a|one|a list of) time")
+            for t in (1.001, -0.001, np.nan, True, 0.5j, "x", [0.5])
+        ),
+        ({"loc": np.full((300, 2), np.nan, np.float32)}, {}, "finite numbers, got others in 300 Gaussians"),
+    ],
+)
+def test_all_ways_refuse_the_same(entrance, change, how, message):
     model = _model()
-    for size in ((0, 5), (5.5, 5), 5):
-        for call in (VideoRenderer, lambda model, size: model.render(0.0, size)):
-            with pytest.raises(ValueError, match=r"^size: expected \(height, width\)"):
-                call(model, size)
-    broken = eqx.tree_at(lambda m: m.splats.loc, model, jnp.asarray(model.splats.loc).at[3].set(jnp.nan))
-    for call in (VideoRenderer, lambda model: model.render(0.5)):
-        with pytest.raises(ValueError, match="finite numbers, got others in 1 Gaussian"):
-            call(broken)
+    if change is not None:
+        model = dataclasses.replace(model, splats=dataclasses.replace(model.splats, **change))
+    with pytest.raises(ValueError, match=message):
+        ENTRANCES[entrance](model, **how)
+
+
+@pytest.mark.parametrize(
+    ("change", "how"),
+    [
+        (lambda model: model, {"t": 1 + 5e-7}),
+        (lambda model: model, {"t": np.float64(-5e-7)}),
+        (lambda model: model, {"t": 1}),
+        (lambda model: model.with_options(RenderOptions(tile_size=8)), {}),
+        (_without_gaussians, {}),
+    ],
+)
+def test_all_ways_accept_the_same(change, how):
+    first, *others = (enter(change(_model()), **how) for enter in ENTRANCES.values())
+    for image in others:
+        assert np.abs(image - np.clip(first, 0, 1)).mean() < 0.003
+
+
+def test_unknown_compositing_is_no_model():
+    with pytest.raises(ValueError, match=r"^compositing: expected one of"):
+        dataclasses.replace(_model(), compositing="under")

@@ -181,8 +181,8 @@ def fit_steps(
             stepper.adopt(state)
         else:
             guard.keep_good(state)
-            before = clock()
             for control in controls:
+                before = clock()
                 if control.is_due(state):
                     state.fetch_all()
                     control.apply(state)

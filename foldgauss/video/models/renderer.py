@@ -53,11 +53,12 @@ def check_time(t: float, name: str = "t", cure: str = "Frame k is at frame_times
     """Raise ValueError unless t is one time, in [0, 1] if its value is known."""
     try:
         time = jnp.asarray(t)
-        value = concrete_value(time)
     except (TypeError, ValueError):
         raise invalid(name, expected="a time in [0, 1]", got=short_repr(t)) from None
-    require(not time.ndim, name, expected="one time in [0, 1]", got=short_repr(t))
-    require(value is None or 0 <= value <= 1, name, expected="a time in [0, 1]", got=value, cure=cure)
+    fits = not time.ndim and time.dtype.kind in "fiu"
+    require(fits, name, expected="one time in [0, 1]", got=short_repr(t))
+    value, close = concrete_value(time), 1e-6  # rounding of summed steps
+    require(value is None or -close <= value <= 1 + close, name, expected="a time in [0, 1]", got=value, cure=cure)
 
 
 def choose_time(video: "RenderedVideo", time: float | None, frame: int | None, seconds: float | None) -> float:
@@ -129,7 +130,7 @@ class RenderedVideo:
     ) -> Iterator[UInt8[np.ndarray, "height width channels"]]:
         """Images at `times` (default: the frame times) one by one, over `background`, uint8 (height, width, 3);
         (height, width, 4), with premultiplied colors, where it is None."""
-        yield from VideoRenderer(self, size, background=background).frames(times)
+        return VideoRenderer(self, size, background=background).frames(times)
 
     def at(self, t: float, size: tuple[int, int] | None = None) -> Splats2D:
         """The splats of time t, front to back, in pixels of an image of `size` (default: its own); NumPy leaves.
@@ -200,16 +201,10 @@ class VideoRenderer:
     ) -> Iterator[UInt8[np.ndarray, "height width channels"]]:
         """The images at `times` (default: the model's frame times), one by one."""
         chosen = np.asarray(self.model.frame_times.times() if times is None else times)
-        close = 1e-6  # rounding of summed steps
-        require(
-            chosen.ndim == 1 and chosen.dtype.kind in "fiu" and ((chosen >= -close) & (chosen <= 1 + close)).all(),
-            "times",
-            expected="a list of times in [0, 1]",
-            got=short_repr(times),
-            cure="Frame k is at frame_times.times()[k].",
-        )
+        require(chosen.ndim == 1, "times", expected="a list of times in [0, 1]", got=short_repr(times))
         for t in chosen:
-            yield self.frame(t)
+            check_time(t, "times")
+        return map(self.frame, map(float, chosen))
 
     def image(self, t: float) -> Float[np.ndarray, "channels height width"]:
         """The image at time t before rounding to 8 bits: planar float32, about [0, 1]."""

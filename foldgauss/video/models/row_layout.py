@@ -56,8 +56,8 @@ def group_bits(degree: int) -> UInt8[np.ndarray, " width"]:
 
 def pack(splats: FoldedSplats) -> np.ndarray:
     """Leaves to rows, float32 (num, 11 + 2 degree); with shared paths the last column is `path_index`."""
-    num = splats.num_gaussians
-    leaves = [np.asarray(getattr(splats, name), np.float32).reshape(num, -1) for name in _leaf_names()]
+    num, place = splats.num_gaussians, columns(splats.degree)
+    leaves = [np.asarray(getattr(splats, k), np.float32).reshape(num, at.stop - at.start) for k, at in place.items()]
     if splats.paths is not None:
         leaves.append(np.asarray(splats.path_index, np.float32)[:, None])
     return np.ascontiguousarray(np.concatenate(leaves, axis=1))

@@ -1,7 +1,5 @@
 """Folded splats: Folded-Gaussians with opacity and color, the trainable parameters of a video."""
 
-import dataclasses
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -48,7 +46,7 @@ class FoldedSplats(eqx.Module):
     those on a path are moved in addition; None without `path_index`.
 
     Source: VeGaS eq:vegas_equiv and "Implementation Details"; array order is depth order. Raises ValueError for an
-    envelope with several powers or floors.
+    envelope with several powers or floors, and for paths without `path_index` or the reverse.
     """
 
     loc: Float[Array, "num 2"]
@@ -73,6 +71,12 @@ class FoldedSplats(eqx.Module):
                 got=f"shape {shape}",
                 cure="Give each envelope a video of its own, and stack these by layers().",
             )
+        require(
+            (self.path_index is None) == (self.paths is None),
+            "path_index",
+            expected="one where there are paths, and only there",
+            got="none" if self.path_index is None else "one without paths",
+        )
 
     @property
     def num_gaussians(self) -> int:
@@ -93,9 +97,9 @@ class FoldedSplats(eqx.Module):
 
         def index(leaf: Array) -> Array:
             # Not `jnp.asarray`, which compiles a program for each number of Gaussians.
-            return jax.device_put(np.asarray(leaf)[which]) if np.ndim(leaf) else leaf  # of the envelope
+            return leaf if leaf is self.paths or not np.ndim(leaf) else jax.device_put(np.asarray(leaf)[which])
 
-        return dataclasses.replace(jax.tree.map(index, dataclasses.replace(self, paths=None)), paths=self.paths)
+        return jax.tree.map(index, self, is_leaf=lambda part: part is self.paths)
 
     def gaussians(self) -> FoldedGaussian:
         """The batch of Folded-Gaussians in the frame, batch shape (num,), event shape (3,).

@@ -7,13 +7,13 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from foldgauss._runtime.checks import require
-from foldgauss.render import RenderOptions, Splats2D, render
+from foldgauss._runtime.checks import check_one_of, require
+from foldgauss.render import COMPOSITINGS, RenderOptions, Splats2D, render
 from foldgauss.render.splats import check_size
 from foldgauss.video.models.background import BLACK, Background, check_background
 from foldgauss.video.models.conditioning import PreparedModel, check_renderable
 from foldgauss.video.models.frame_times import FrameTimes, snap_to_shots
-from foldgauss.video.models.renderer import RenderedVideo, choose_time
+from foldgauss.video.models.renderer import RenderedVideo, check_time, choose_time
 from foldgauss.video.models.splats import FoldedSplats
 
 #: Parameters of a Gaussian, without those of its fold.
@@ -57,6 +57,9 @@ class VideoModel(RenderedVideo, eqx.Module):
     compositing: str = eqx.field(static=True, default="over")
     scale_cutoff: float = eqx.field(static=True, default=0.0)
 
+    def __check_init__(self):
+        check_one_of("compositing", self.compositing, COMPOSITINGS)
+
     @property
     def num_frames(self) -> int:
         return self.frame_times.num_frames
@@ -87,6 +90,7 @@ class VideoModel(RenderedVideo, eqx.Module):
 
     def at(self, t: Float[Array, ""], size: tuple[int, int] | None = None) -> Splats2D:
         """The splats of time t, in pixels of an image of `size` (default: the fitted one)."""
+        check_time(t)
         height, width = self.size
         return self.splats.at(t, scale_cutoff=self.scale_cutoff).to_pixels(
             self.size if size is None else size, aspect=height / width
@@ -135,6 +139,6 @@ class VideoModel(RenderedVideo, eqx.Module):
 @eqx.filter_jit
 def _splats_in_pixels(model: VideoModel, t: Float[Array, ""], size: tuple[int, int]) -> tuple[Splats2D, Array]:
     """The splats, and the number of Gaussians with NaN or infinities."""
-    own = jax.tree.leaves(dataclasses.replace(model.splats, paths=None))
-    finite = [jnp.isfinite(leaf).reshape(model.num_gaussians, -1).all(axis=1) for leaf in own if leaf.ndim]
+    own = jax.tree.leaves(dataclasses.replace(model.splats, path_index=None, paths=None))
+    finite = [jnp.isfinite(leaf).all(axis=tuple(range(1, leaf.ndim))) for leaf in own if leaf.ndim]
     return model.at(t, size), (~jnp.stack(finite).all(axis=0)).sum()
