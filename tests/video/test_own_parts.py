@@ -39,6 +39,18 @@ def test_an_own_loss_is_minimized_as_the_built_in_one(engine):
     assert np.abs(images[0] - images[1]).max() <= 1
 
 
+def test_the_built_in_loss_cannot_be_replaced():
+    with pytest.raises(ValueError, match=r"^name: expected one that is not built in, got '3dgs'"):
+        register_loss("3dgs", mean_error)
+
+
+@pytest.mark.parametrize(("quality", "default"), [(None, 0.7), (50, 0.3)])
+def test_the_squared_error_begins_where_it_is_asked_to(quality, default):
+    assert FitConfig(quality=quality).squared_from == default
+    assert FitConfig(quality=quality, loss=Loss(l2_fraction=0)).squared_from == 1
+    assert FitConfig(quality=quality, loss=Loss(l2_fraction=0.75)).squared_from == 0.25
+
+
 class DropEverySecond(DensityControl):
     """After step 20."""
 

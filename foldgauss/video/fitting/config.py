@@ -113,11 +113,11 @@ class Loss:
             group=OPTIMIZATION,
         ),
     )
-    l2_fraction: float = field(
-        default=0.3,
+    l2_fraction: float | None = field(
+        default=None,
         metadata=setting(
             "Fraction of the steps, at the end, whose loss is the squared error, which PSNR measures",
-            "For a compact model the squared error begins earlier.",
+            "Default: 0.3, or 0.7 for a compact model.",
             bounds="[0, 1]",
         ),
     )
@@ -513,7 +513,9 @@ class FitConfig:
     @property
     def squared_from(self) -> float:
         """The fraction of the plan from which the loss is the squared error; for a compact model early."""
-        return COMPACT_SQUARED_FROM if self.is_compact else 1 - self.loss.l2_fraction
+        if self.loss.l2_fraction is not None:
+            return 1 - self.loss.l2_fraction
+        return COMPACT_SQUARED_FROM if self.is_compact else SQUARED_FROM
 
     @property
     def follows_motion(self) -> bool:
@@ -587,6 +589,8 @@ MOST_PER_PIXEL = 1.6
 
 #: The quality of compact models that `foldgauss fit` has by default.
 DEFAULT_QUALITY = 70.0
+#: The fraction of the plan of a fit from which the loss is the squared error.
+SQUARED_FROM = 0.7
 #: The fraction of the plan of a compact fit from which the loss is the squared error. Of clips with alpha, where most
 #: pixels are empty, it would leave edges blurred for long.
 COMPACT_SQUARED_FROM = 0.3

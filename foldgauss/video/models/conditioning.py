@@ -438,11 +438,15 @@ class PreparedModel(PreparedVideo):
         height, width = model.size
         self.rows = pack(model.splats)
         check_renderable(model.splats, int((~np.isfinite(self.rows)).any(-1).sum()))
-        aspect = height / width if aspect is None else aspect
-        paths = jax.tree.map(np.asarray, model.splats.paths)
-        own = {"aspect": aspect, "paths": paths, "scale_cutoff": model.scale_cutoff}
-        power, floor = float(model.splats.envelope.power), float(model.splats.envelope.floor)
-        self.spec = ConditioningSpec(model.splats.degree, power, floor, tuple(size), **own)
+        self.spec = ConditioningSpec(
+            model.splats.degree,
+            float(model.splats.envelope.power),
+            float(model.splats.envelope.floor),
+            tuple(size),
+            aspect=height / width if aspect is None else aspect,
+            paths=jax.tree.map(np.asarray, model.splats.paths),
+            scale_cutoff=model.scale_cutoff,
+        )
         self.window = find_windows(self.rows, self.spec)
         self.times = np.asarray(model.frame_times.times())
 

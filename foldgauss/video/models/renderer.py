@@ -55,8 +55,7 @@ def check_time(t: float, name: str = "t", cure: str = "Frame k is at frame_times
         time = jnp.asarray(t)
     except (TypeError, ValueError):
         raise invalid(name, expected="a time in [0, 1]", got=short_repr(t)) from None
-    fits = not time.ndim and time.dtype.kind in "fiu"
-    require(fits, name, expected="one time in [0, 1]", got=short_repr(t))
+    require(not time.ndim and time.dtype.kind in "fiu", name, expected="one time in [0, 1]", got=short_repr(t))
     value, close = concrete_value(time), 1e-6  # rounding of summed steps
     require(value is None or -close <= value <= 1 + close, name, expected="a time in [0, 1]", got=value, cure=cure)
 
@@ -208,6 +207,7 @@ class VideoRenderer:
 
     def image(self, t: float) -> Float[np.ndarray, "channels height width"]:
         """The image at time t before rounding to 8 bits: planar float32, about [0, 1]."""
+        check_time(t)
         first, *others = (self.image_of(splats, weight) for weight, splats in self._prepared.weighted_splats(t))
         return sum(others, start=first)
 

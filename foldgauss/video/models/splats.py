@@ -63,12 +63,11 @@ class FoldedSplats(eqx.Module):
 
     def __check_init__(self):
         for name in ("power", "floor"):
-            shape = jnp.shape(getattr(self.envelope, name))
             require(
-                not shape,
+                not jnp.ndim(getattr(self.envelope, name)),
                 f"envelope.{name}",
                 expected="one number for all Gaussians",
-                got=f"shape {shape}",
+                got=f"shape {jnp.shape(getattr(self.envelope, name))}",
                 cure="Give each envelope a video of its own, and stack these by layers().",
             )
         require(
