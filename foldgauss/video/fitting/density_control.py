@@ -20,12 +20,18 @@ class DensityControl(abc.ABC):
 
     @abc.abstractmethod
     def is_due(self, state: FitState) -> bool:
-        """Whether to call `apply` now: `state.step` steps are done. Called after every step, so it should be cheap."""
+        """Whether to call `apply` now: `state.step` steps are done. Called after every step, so it should be cheap.
+
+        Of the arrays, those that every step fetches are on the host (`FitState`) with all engines.
+        """
 
     @abc.abstractmethod
     def apply(self, state: FitState) -> None:
         """Change the Gaussians of the state."""
 
     def reserve(self, state: FitState) -> float:
-        """Seconds that the calls to come will take, for which a fit with a limited time keeps them."""
+        """Seconds that the calls to come will take, for which a fit with a limited time keeps them.
+
+        Arrays are where they are for `is_due`.
+        """
         return 0.0

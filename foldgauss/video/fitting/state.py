@@ -123,8 +123,8 @@ class FitState:
     """The arrays and counters of a running fit. A step consumes its state: arrays are updated in place.
 
     The arrays of a fit on a device are `held` there until `fetch_all`: reading another one than those that every step
-    fetches (`frame_errors`, `time_logits`, `path_maps`) raises AttributeError. An array that is assigned is used from
-    the next step on.
+    fetches (`frame_errors`, `time_logits`, `path_maps`, which are then read-only) raises AttributeError. An array that
+    is assigned is used from the next step on.
     """
 
     rows: np.ndarray = field(metadata=_array(np.float32, "num_gaussians", "width"))  # parameters, see `row_layout`
@@ -193,7 +193,8 @@ class FitState:
         return f"{type(self).__name__}(step {self.step}, {self.num_gaussians} Gaussians)"
 
     def __getattr__(self, name: str) -> Any:
-        cure = f" on the host: call fetch_all() of the {type(self).__name__} first" if name in ARRAYS else ""
+        on_device = name in ARRAYS or hasattr(type(self), name)  # or a property that reads some
+        cure = f" on the host: call fetch_all() of the {type(self).__name__} first" if on_device else ""
         raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}{cure}", name=name, obj=self)
 
     @property
@@ -223,7 +224,7 @@ class FitState:
 
         Of those held on a device, this is known of `rows` and `second`.
         """
-        if name not in self.__dict__:
+        if name not in self.__dict__ and self.held is not None and name in self.held.finite:
             return self.held.finite[name]
         with np.errstate(invalid="ignore", over="ignore"):
             return bool(np.isfinite(getattr(self, name).sum()))
@@ -268,6 +269,8 @@ class FitState:
             self.__dict__.pop(name, None)
         self.held = held
         self.__dict__.update(held.on_host)
+        for array in held.on_host.values():
+            array.flags.writeable = False  # a change in place would be lost
 
     def fetch_all(self) -> None:
         """Fetch all arrays that were not assigned meanwhile, and those of `last_finite`: none is held any more.
@@ -275,9 +278,10 @@ class FitState:
         The next step sends them to the device again. Without a device there is nothing to do.
         """
         if self.held is not None:
-            arrays = {name: self.held.fetch(name) for name in ARRAYS if name not in self.__dict__}
+            own = self.__dict__
+            arrays = {name: np.array(own[name]) if name in own else self.held.fetch(name) for name in ARRAYS}
             self.held = None
-            self.__dict__.update(arrays)
+            own.update(arrays)
         if self.last_finite is not None:
             self.last_finite.fetch_all()
 

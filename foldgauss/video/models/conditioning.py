@@ -29,7 +29,7 @@ from foldgauss.video.models.shared_paths import (
     invert_maps,
     to_pixel_maps,
 )
-from foldgauss.video.models.splats import SH_C0, TAU_MAX, FoldedSplats
+from foldgauss.video.models.splats import SH_C0, TAU_MAX
 
 CHUNK = 4096  # Gaussians per task
 
@@ -410,16 +410,18 @@ def backpropagate(
     return float(by_time.sum())
 
 
-def check_renderable(splats: FoldedSplats, num_broken: int) -> None:
-    """Raise ValueError if any Gaussian has NaN or infinities, and for paths as `check_paths`."""
+def check_renderable(model: Any, num_broken: int) -> None:
+    """Raise ValueError if frame times or any Gaussian have NaN or infinities, for envelopes, and as `check_paths`."""
+    broken_times = int((~np.isfinite(model.frame_times.logits)).sum())
     require(
-        not num_broken,
+        not num_broken + broken_times,
         "model",
         expected="finite numbers",
-        got=f"others in {num_broken:,} Gaussians",
+        got=f"others in {num_broken:,} Gaussians and {broken_times:,} frame times",
         cure="The fit diverged, or the model was edited: fit again.",
     )
-    check_paths(splats)
+    dataclasses.replace(model.splats, envelope=dataclasses.replace(model.splats.envelope))  # which have their checks
+    check_paths(model.splats)
 
 
 class PreparedModel(PreparedVideo):
@@ -437,7 +439,7 @@ class PreparedModel(PreparedVideo):
         check_size(size)
         height, width = model.size
         self.rows = pack(model.splats)
-        check_renderable(model.splats, int((~np.isfinite(self.rows)).any(-1).sum()))
+        check_renderable(model, int((~np.isfinite(self.rows)).any(-1).sum()))
         self.spec = ConditioningSpec(
             model.splats.degree,
             float(model.splats.envelope.power),

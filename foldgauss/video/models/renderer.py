@@ -8,12 +8,12 @@ import math
 from collections.abc import Iterator
 from operator import attrgetter
 
+import jax
 import jax.numpy as jnp
 import numba as nb
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from foldgauss._numerics.batch import concrete_value
 from foldgauss._runtime import notebook_hooks
 from foldgauss._runtime.checks import invalid, is_integer, is_within, require, short_repr
 from foldgauss._runtime.kernels import kernel
@@ -51,13 +51,14 @@ class PreparedVideo:
 
 def check_time(t: float, name: str = "t", cure: str = "Frame k is at frame_times.times()[k].") -> None:
     """Raise ValueError unless t is one time, in [0, 1] if its value is known."""
+    traced, close = isinstance(t, jax.core.Tracer), 1e-6  # rounding of summed steps
     try:
-        time = jnp.asarray(t)
-    except (TypeError, ValueError):
+        time = t if traced else np.asarray(t)
+    except ValueError:
         raise invalid(name, expected="a time in [0, 1]", got=short_repr(t)) from None
-    require(not time.ndim and time.dtype.kind in "fiu", name, expected="one time in [0, 1]", got=short_repr(t))
-    value, close = concrete_value(time), 1e-6  # rounding of summed steps
-    require(value is None or -close <= value <= 1 + close, name, expected="a time in [0, 1]", got=value, cure=cure)
+    real = time.dtype.kind in "iu" or jnp.issubdtype(time.dtype, jnp.floating)
+    require(real and not time.ndim, name, expected="one time in [0, 1]", got=short_repr(t))
+    require(traced or -close <= time <= 1 + close, name, expected="a time in [0, 1]", got=short_repr(t), cure=cure)
 
 
 def choose_time(video: "RenderedVideo", time: float | None, frame: int | None, seconds: float | None) -> float:
@@ -203,7 +204,7 @@ class VideoRenderer:
         require(chosen.ndim == 1, "times", expected="a list of times in [0, 1]", got=short_repr(times))
         for t in chosen:
             check_time(t, "times")
-        return map(self.frame, map(float, chosen))
+        return (self.frame(float(t)) for t in chosen)
 
     def image(self, t: float) -> Float[np.ndarray, "channels height width"]:
         """The image at time t before rounding to 8 bits: planar float32, about [0, 1]."""

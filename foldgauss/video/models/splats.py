@@ -62,6 +62,8 @@ class FoldedSplats(eqx.Module):
     paths: SharedPaths | None = None
 
     def __check_init__(self):
+        given = type(self.envelope)
+        require(given is TimeLikelihood, "envelope", expected="a TimeLikelihood", got=given.__name__)
         for name in ("power", "floor"):
             require(
                 not jnp.ndim(getattr(self.envelope, name)),
@@ -151,8 +153,8 @@ class FoldedSplats(eqx.Module):
         shared paths. To render the density itself, use `density_image`.
 
         Shapes: `mixture` of (x, y, t) without batch dimensions, in model space, m_t in (0, 1), with polynomial or zero
-        folds and one time-likelihood or constant envelope; `color` (3,) or (num, 3), not below 0. Within `jax.jit` or
-        `jax.grad` the envelope is that of the first component.
+        folds and one time-likelihood or constant envelope; `color` (3,) or (num, 3), not below 0. Where the values
+        of the envelope are not known, as inside `jax.jit`, that of the first component is taken for all.
         Raises ValueError for any other mixture or color.
 
         Example: `FoldedSplats.from_mixture(mixture, color=[1.0, 0.5, 0.0]).at(0.5)`.

@@ -125,9 +125,9 @@ class VideoModel(RenderedVideo, eqx.Module):
         check_size(size)
         t = choose_time(self, time, frame, seconds)
         t = snap_to_shots(jnp.asarray(t, jnp.float32), self.frame_times.times())
-        splats, num_broken = _splats_in_pixels(self, t, tuple(size))
-        if not isinstance(num_broken, jax.core.Tracer):
-            check_renderable(self.splats, int(num_broken))
+        splats, num_broken = _splats_in_pixels(self, t, tuple(map(int, size)))
+        if not any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves((self, num_broken))):
+            check_renderable(self, int(num_broken))
         behind = jnp.asarray(check_background(background, self.compositing), splats.mean.dtype)[:3]
         how = {"engine": engine, "compositing": self.compositing, "options": self.options}
         if background is not None:

@@ -14,7 +14,11 @@ export function readSafetensors(buffer) {
   if (about.kind === "edited-video") throw new Error("This is an edited video whose edits no folded model holds. Render it with foldgauss render, or open the model and the edit script.");
   if (about.kind !== "video") throw new Error(`This is a ${JSON.stringify(about.kind)}, not a model. Open the file that foldgauss fit wrote.`);
   const header = JSON.parse(about.header), { num_gaussians: num, degree } = header;
-  const leaf = (name) => tensor(`splats.${name}`), envelope = (name) => tensor(`splats.envelope.${name}`)[0];
+  const leaf = (name) => tensor(`splats.${name}`), envelope = (name) => {
+    const own = tensor(`splats.envelope.${name}`);
+    if (own.length !== 1 || !Number.isFinite(own[0])) throw new Error(DAMAGED);
+    return own[0];
+  };
   const leaves = {};
   for (const name of ["loc", "log_scale", "angle_logit", "time_loc_logit", "log_time_scale", "coefficients", "opacity_logit", "color_dc"]) leaves[name] = leaf(name);
   leaves.frame_times = tensor("frame_times.logits");

@@ -58,12 +58,14 @@ class CpuStepper:
 
     def adopt(self, state: FitState) -> None:
         """Prepare for a state whose arrays were replaced."""
-        self.grad = np.zeros_like(state.rows)
+        self.rows, self.grad = state.rows, np.zeros_like(state.rows)
         self.window = find_windows(state.rows, self.spec)
 
     def step(self, state: FitState, progress: float) -> StepResult:
         """One step at a fraction of the plan. The step counter is the caller's."""
         config, num_frames = self.config, self.num_frames
+        if state.rows is not self.rows:  # by an observer of the fit
+            self.adopt(state)
         if self.frames.shape[3] == 4:
             self.background = random_background(config.seed, state.step)
         times = np.asarray(frame_times(state.time_logits))

@@ -116,7 +116,7 @@ class JaxStepper:
             arrays,
             num,
             state.growing,
-            on_host={name: getattr(state, name) for name in ON_HOST},
+            on_host={name: np.array(getattr(state, name)) for name in ON_HOST},
             finite={name: state.is_finite(name) for name in ("rows", "second")},
         )
         state.hold(held)
