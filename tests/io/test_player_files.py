@@ -6,6 +6,7 @@ import secrets
 from contextlib import contextmanager
 
 import cv2
+import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -165,9 +166,11 @@ def test_damaged_models_are_told(opened, compact, tmp_path):
     bare = opened(None)
     good = save_video_model(tmp_path / "m.safetensors", soft_model()).read_bytes()
     scene = write_3dgs_ply(tmp_path / "m.ply", soft_model(), 0.4).read_bytes()
+    endless = eqx.tree_at(lambda model: model.splats.envelope.power, soft_model(), np.float32(np.inf))
     for name, content in (
         ("cut.safetensors", good[:-100]),
         ("nan.safetensors", good[:-8] + np.float32([np.nan, 1]).tobytes()),
+        ("power.safetensors", save_video_model(tmp_path / "p.safetensors", endless).read_bytes()),
         ("cut.fgz", compact.read_bytes()[:-50]),
         ("nan.ply", scene[:-4] + np.float32(np.nan).tobytes()),
     ):

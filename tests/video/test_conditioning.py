@@ -212,7 +212,7 @@ def test_models_that_cannot_be_prepared_raise():
 @pytest.mark.parametrize("shape", [(300,), (1,)])
 def test_splats_have_one_envelope(name, shape):
     """Whichever way they are rendered."""
-    with pytest.raises(ValueError, match=rf"^envelope\.{name}: expected one number for all Gaussians, .*layers"):
+    with pytest.raises(ValueError, match=r"^envelope: expected a TimeLikelihood with one power and one floor.*layers"):
         dataclasses.replace(random_splats(), envelope=TimeLikelihood(**{name: np.full(shape, 0.5, np.float32)}))
 
 

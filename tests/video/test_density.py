@@ -140,7 +140,7 @@ WRONG = [
         lambda: splats_of(envelope=CallableEnvelope(lambda t, m, scale: -jnp.abs(t - m))),
         "mixture.components.envelope",
     ),
-    (lambda: splats_of(envelope=TimeLikelihood(np.float32([1, 1, 2, 1, 1]))), "envelope.power"),
+    (lambda: splats_of(envelope=TimeLikelihood(np.float32([1, 1, 2, 1, 1]))), "envelope"),
     (lambda: splats_of(color=[1.0, 1.0]), "color"),
     (lambda: splats_of(color=[1.0, 1.0, -0.1]), "color"),
     (lambda: FoldedSplats.from_mixture(LINE, color=[1.0, 1.0, 1.0]), "mixture"),

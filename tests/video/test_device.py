@@ -278,6 +278,12 @@ def test_arrays_are_fetched_when_asked(monkeypatch):
     for name in set(ARRAYS) - set(ON_HOST):
         with pytest.raises(AttributeError, match=rf"{name}.*fetch_all"):
             getattr(state, name)
+    for reads_one in (lambda: state.sizes, lambda: state.is_finite("first")):
+        with pytest.raises(AttributeError, match="fetch_all"):
+            reads_one()
+    for name in ON_HOST:
+        with pytest.raises(ValueError, match="read-only"):
+            getattr(state, name)[...] = 0
     with pytest.raises(AttributeError, match=r"'rowz'$"):
         state.rowz  # noqa: B018
     state.fetch_all()

@@ -69,6 +69,21 @@ def test_an_own_control_changes_the_gaussians(engine):
     assert counts == [30] * 19 + [15] * 21
 
 
+@pytest.mark.parametrize("engine", ["cpu", pytest.param("xla", marks=pytest.mark.slow)])
+def test_an_observer_may_drop_gaussians(engine):
+    for state, info in fit_steps(CLIP, dataclasses.replace(CONFIG, engine=engine)):
+        if info.step == 20:
+            state.fetch_all()
+            state.keep(np.arange(0, 30, 2))
+    assert state.rows.shape[0] == info.num_gaussians == 15
+
+
+def test_a_state_of_other_frames_is_refused():
+    state, _ = next(iter(fit_steps(CLIP, CONFIG)))
+    with pytest.raises(ValueError, match=rf"^frames: expected as many as the state has, {len(CLIP)}, got 3"):
+        next(fit_steps(CLIP[:3], CONFIG, state))
+
+
 def test_leaves_are_views_of_the_rows():
     state, _ = next(iter(fit_steps(CLIP, CONFIG)))
     model = fit(CLIP, dataclasses.replace(CONFIG, steps=1)).model

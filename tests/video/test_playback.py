@@ -3,8 +3,11 @@
 import dataclasses
 
 import equinox as eqx
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
+from path_models import path_model
 
 from foldgauss.envelope import TimeLikelihood
 from foldgauss.render import RenderOptions
@@ -105,6 +108,35 @@ def test_all_ways_accept_the_same(change, how):
     first, *others = (enter(change(_model()), **how) for enter in ENTRANCES.values())
     for image in others:
         assert np.abs(image - np.clip(first, 0, 1)).mean() < 0.003
+
+
+@pytest.mark.parametrize("entrance", ENTRANCES)
+@pytest.mark.parametrize(
+    ("where", "value", "message"),
+    [
+        (lambda m: m.splats.envelope.power, np.float32(np.nan), "^power: expected a finite number"),
+        (lambda m: m.splats.envelope.floor, np.float32(1), "^floor: expected a number in"),
+        (lambda m: m.splats.envelope.power, np.ones(300, np.float32), "^envelope: expected a TimeLikelihood with one"),
+        (
+            lambda m: m.frame_times.logits,
+            np.full(4, np.inf, np.float32),
+            "finite numbers, got others in its frame times",
+        ),
+    ],
+)
+def test_what_was_replaced_in_a_tree_is_checked(entrance, where, value, message):
+    with pytest.raises(ValueError, match=message):
+        ENTRANCES[entrance](eqx.tree_at(where, _model(), value))
+
+
+def test_render_has_gradients_by_every_leaf_with_shared_paths():
+    """Outside `jit`, too, where integers and counts have known values beside what is differentiated."""
+    model = path_model()
+    slopes = eqx.filter_grad(lambda one: one.render(0.5).sum())(model)
+    assert np.abs(slopes.splats.paths.matrices).max() > 0
+    which = jnp.stack([jnp.asarray(model.splats.path_index)] * 2)
+    dark = jax.vmap(lambda own: eqx.tree_at(lambda m: m.splats.path_index, model, own).render(0.5).sum())(which)
+    np.testing.assert_allclose(dark, float(model.render(0.5).sum()), rtol=1e-5)
 
 
 def test_unknown_compositing_is_no_model():

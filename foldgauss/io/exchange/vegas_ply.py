@@ -250,12 +250,11 @@ def _check_writable_as_vegas(model: VideoModel) -> None:
         got="1",
         cure="Write the picture as a still scene, ply3dgs.",
     )
-    envelope = model.splats.envelope
     require(
-        envelope.floor == 0,
+        model.splats.envelope.floor == 0,
         "model's floor",
         expected="0.0, the only one in a VeGaS file",
-        got=float(envelope.floor),
+        got=float(model.splats.envelope.floor),
         cure="Fit it without a floor.",
     )
     require(
@@ -273,7 +272,7 @@ def _check_writable_as_vegas(model: VideoModel) -> None:
         cure="The fit diverged: fit again.",
     )
     require(
-        envelope.power > 0,
+        model.splats.envelope.power > 0,
         "model's power",
         expected="above 0, as VeGaS files require",
         got="0",

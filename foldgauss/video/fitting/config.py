@@ -513,9 +513,8 @@ class FitConfig:
     @property
     def squared_from(self) -> float:
         """The fraction of the plan from which the loss is the squared error; for a compact model early."""
-        if self.loss.l2_fraction is not None:
-            return 1 - self.loss.l2_fraction
-        return COMPACT_SQUARED_FROM if self.is_compact else SQUARED_FROM
+        default = COMPACT_SQUARED_FROM if self.is_compact else SQUARED_FROM
+        return default if self.loss.l2_fraction is None else 1 - self.loss.l2_fraction
 
     @property
     def follows_motion(self) -> bool:

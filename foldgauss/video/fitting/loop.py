@@ -159,8 +159,12 @@ def fit_steps(
     _warm_up(frames, config, engine)
     find_motion = motion_finder(frames, motion)
     state = start(frames, config, find_motion, clock) if state is None else state
-    known = len(state.frame_errors)
-    require(known == len(frames), "frames", expected=f"{known}, as the state has", got=len(frames))
+    require(
+        len(state.frame_errors) == len(frames),
+        "frames",
+        expected=f"as many as the state has, {len(state.frame_errors)}",
+        got=len(frames),
+    )
     planner, time_left = StepPlanner(config), TimeLeft(state, config)
     guard = Guard(state, config, steps_per_pass(config, len(frames)), alpha=has_alpha)
     controls = [*_make_controls(frames, config, state, find_motion), *controls]

@@ -193,8 +193,8 @@ class FitState:
         return f"{type(self).__name__}(step {self.step}, {self.num_gaussians} Gaussians)"
 
     def __getattr__(self, name: str) -> Any:
-        on_device = name in ARRAYS or hasattr(type(self), name)  # or a property that reads some
-        cure = f" on the host: call fetch_all() of the {type(self).__name__} first" if on_device else ""
+        # An array that is held, or a property that reads one.
+        cure = ", on the host: call its fetch_all() first" if name in ARRAYS or hasattr(type(self), name) else ""
         raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}{cure}", name=name, obj=self)
 
     @property
@@ -267,10 +267,7 @@ class FitState:
         """From now on all arrays are those of `held`."""
         for name in ARRAYS:
             self.__dict__.pop(name, None)
-        self.held = held
-        self.__dict__.update(held.on_host)
-        for array in held.on_host.values():
-            array.flags.writeable = False  # a change in place would be lost
+        self.__dict__.update(held.on_host, held=held)
 
     def fetch_all(self) -> None:
         """Fetch all arrays that were not assigned meanwhile, and those of `last_finite`: none is held any more.
@@ -278,18 +275,16 @@ class FitState:
         The next step sends them to the device again. Without a device there is nothing to do.
         """
         if self.held is not None:
-            own = self.__dict__
+            own = vars(self)
             arrays = {name: np.array(own[name]) if name in own else self.held.fetch(name) for name in ARRAYS}
-            self.held = None
-            own.update(arrays)
+            self.__dict__.update(arrays, held=None)
         if self.last_finite is not None:
             self.last_finite.fetch_all()
 
     @property
     def changed(self) -> bool:
         """Whether an array was assigned since arrays are held."""
-        own, held = self.__dict__, self.held
-        return held is not None and any(own.get(name) is not held.on_host.get(name) for name in ARRAYS)
+        return self.held is not None and any(vars(self).get(name) is not self.held.on_host.get(name) for name in ARRAYS)
 
 
 #: The names of the arrays of a `FitState`.

@@ -412,12 +412,11 @@ def backpropagate(
 
 def check_renderable(model: Any, num_broken: int) -> None:
     """Raise ValueError if frame times or any Gaussian have NaN or infinities, for envelopes, and as `check_paths`."""
-    broken_times = int((~np.isfinite(model.frame_times.logits)).sum())
     require(
-        not num_broken + broken_times,
+        not num_broken and np.isfinite(model.frame_times.logits).all(),
         "model",
         expected="finite numbers",
-        got=f"others in {num_broken:,} Gaussians and {broken_times:,} frame times",
+        got=f"others in {num_broken:,} Gaussians" if num_broken else "others in its frame times",
         cure="The fit diverged, or the model was edited: fit again.",
     )
     dataclasses.replace(model.splats, envelope=dataclasses.replace(model.splats.envelope))  # which have their checks

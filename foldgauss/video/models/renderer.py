@@ -56,8 +56,8 @@ def check_time(t: float, name: str = "t", cure: str = "Frame k is at frame_times
         time = t if traced else np.asarray(t)
     except ValueError:
         raise invalid(name, expected="a time in [0, 1]", got=short_repr(t)) from None
-    real = time.dtype.kind in "iu" or jnp.issubdtype(time.dtype, jnp.floating)
-    require(real and not time.ndim, name, expected="one time in [0, 1]", got=short_repr(t))
+    fits = not time.ndim and (time.dtype.kind in "iu" or jnp.issubdtype(time.dtype, jnp.floating))
+    require(fits, name, expected="one time in [0, 1]", got=short_repr(t))
     require(traced or -close <= time <= 1 + close, name, expected="a time in [0, 1]", got=short_repr(t), cure=cure)
 
 

@@ -62,16 +62,14 @@ class FoldedSplats(eqx.Module):
     paths: SharedPaths | None = None
 
     def __check_init__(self):
-        given = type(self.envelope)
-        require(given is TimeLikelihood, "envelope", expected="a TimeLikelihood", got=given.__name__)
-        for name in ("power", "floor"):
-            require(
-                not jnp.ndim(getattr(self.envelope, name)),
-                f"envelope.{name}",
-                expected="one number for all Gaussians",
-                got=f"shape {jnp.shape(getattr(self.envelope, name))}",
-                cure="Give each envelope a video of its own, and stack these by layers().",
-            )
+        shapes = [jnp.shape(leaf) for leaf in jax.tree.leaves(self.envelope)]
+        require(
+            isinstance(self.envelope, TimeLikelihood) and shapes == [(), ()],
+            "envelope",
+            expected="a TimeLikelihood with one power and one floor for all Gaussians",
+            got=f"{type(self.envelope).__name__} with parameters of shapes {shapes}",
+            cure="Give each envelope a video of its own, and stack these by layers().",
+        )
         require(
             (self.path_index is None) == (self.paths is None),
             "path_index",

@@ -139,6 +139,6 @@ class VideoModel(RenderedVideo, eqx.Module):
 @eqx.filter_jit
 def _splats_in_pixels(model: VideoModel, t: Float[Array, ""], size: tuple[int, int]) -> tuple[Splats2D, Array]:
     """The splats, and the number of Gaussians with NaN or infinities."""
-    own = jax.tree.leaves(dataclasses.replace(model.splats, path_index=None, paths=None))
-    finite = [jnp.isfinite(leaf).all(axis=tuple(range(1, leaf.ndim))) for leaf in own if leaf.ndim]
-    return model.at(t, size), (~jnp.stack(finite).all(axis=0)).sum()
+    own = filter(jnp.ndim, jax.tree.leaves(dataclasses.replace(model.splats, path_index=None, paths=None)))
+    finite = jnp.stack([jnp.isfinite(leaf).all(axis=tuple(range(1, leaf.ndim))) for leaf in own])
+    return model.at(t, size), (~finite.all(axis=0)).sum()

@@ -8,6 +8,7 @@ import math
 from collections.abc import Callable
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from foldgauss.video.fitting.config import FitConfig, chosen_num_gaussians, most_gaussians
@@ -44,7 +45,8 @@ _FIELDS = FitState.array_fields()
 class HeldArrays:
     """The arrays of a `FitState` on a device. The next step consumes them.
 
-    `on_host`: those of `ON_HOST`, fetched. `finite`: of `rows` and `second`, whether all values are.
+    `on_host`: those of `ON_HOST`, fetched; read-only, as a change in place would be lost. `finite`: of `rows` and
+    `second`, whether all values are.
     """
 
     def __init__(
@@ -116,7 +118,7 @@ class JaxStepper:
             arrays,
             num,
             state.growing,
-            on_host={name: np.array(getattr(state, name)) for name in ON_HOST},
+            on_host={name: np.asarray(jnp.array(getattr(state, name))) for name in ON_HOST},
             finite={name: state.is_finite(name) for name in ("rows", "second")},
         )
         state.hold(held)
@@ -144,7 +146,7 @@ class JaxStepper:
             arrays,
             held.num,
             state.growing,
-            on_host={name: np.array(getattr(report, name)) for name in ON_HOST},
+            on_host={name: getattr(report, name) for name in ON_HOST},
             finite={"rows": bool(report.finite_rows), "second": bool(report.finite_second)},
         )
         state.hold(held)
