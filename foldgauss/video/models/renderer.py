@@ -57,7 +57,7 @@ def check_time(t: float, name: str = "t", cure: str = "Frame k is at frame_times
     except ValueError:
         raise invalid(name, expected="a time in [0, 1]", got=short_repr(t)) from None
     fits = not time.ndim and (time.dtype.kind in "iu" or jnp.issubdtype(time.dtype, jnp.floating))
-    require(fits, name, expected="one time in [0, 1]", got=short_repr(t))
+    require(fits, name, expected=f"{'one' if time.ndim else 'a'} time in [0, 1]", got=short_repr(t))
     require(traced or -close <= time <= 1 + close, name, expected="a time in [0, 1]", got=short_repr(t), cure=cure)
 
 
