@@ -196,7 +196,7 @@ def fit_steps(
                     guard.replace_good(state)
                     if control.plans_time:
                         control.seconds = max(control.seconds, clock() - before)
-                        planner.skip(clock() - before, control.reserve(state))
+                        planner.skip(clock() - before, sum(one.reserve(state) for one in controls if one.plans_time))
         state.seconds += clock() - begun
         planner.update(state)
         begun = clock()
