@@ -295,7 +295,7 @@ def test_arrays_are_fetched_when_asked(monkeypatch):
 
 
 def test_fetching_changes_no_step():
-    """Whoever looks at a state leaves it as it is."""
+    """A fit whose state is fetched after every step has the same bits."""
     found = []
     for looks in (False, True):
         for state, _ in fit_steps(FRAMES, CONFIG.replace(steps=12)):

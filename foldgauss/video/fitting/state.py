@@ -270,7 +270,7 @@ class FitState:
         self.__dict__.update(held.on_host, held=held)
 
     def fetch_all(self) -> None:
-        """Fetch all arrays that were not assigned meanwhile, and those of `last_finite`: none is held any more.
+        """Fetch all arrays, also those of `last_finite`; arrays that were assigned meanwhile are kept.
 
         The next step sends them to the device again. Without a device there is nothing to do.
         """
@@ -357,7 +357,7 @@ def spec_of(config: FitConfig, size: tuple[int, int]) -> ConditioningSpec:
 
 
 def envelope_of(config: Any) -> TimeLikelihood:
-    """That of settings, or of all that has `power` and `floor`."""
+    """The envelope of the settings. `config` may be any object with `power` and `floor`."""
     return TimeLikelihood(power=np.float32(config.power), floor=np.float32(config.floor))
 
 

@@ -42,8 +42,8 @@ class FoldedSplats(eqx.Module):
     | `color_dc` | (num, 3) | 0.5 + 0.282 color_dc, not below 0 |
     | `path_index` | (num,) or None | the path that moves the Gaussian, from 1; 0 for none |
 
-    `envelope`: that of all Gaussians, with one power and one floor. `paths`: the motion that Gaussians share, by which
-    those on a path are moved in addition; None without `path_index`.
+    `envelope`: the envelope of all Gaussians, with one power and one floor. `paths`: the motion that Gaussians share,
+    by which those on a path are moved in addition; None without `path_index`.
 
     Source: VeGaS eq:vegas_equiv and "Implementation Details"; array order is depth order. Raises ValueError for an
     envelope with several powers or floors, and for paths without `path_index` or the reverse.
@@ -152,7 +152,7 @@ class FoldedSplats(eqx.Module):
 
         Shapes: `mixture` of (x, y, t) without batch dimensions, in model space, m_t in (0, 1), with polynomial or zero
         folds and one time-likelihood or constant envelope; `color` (3,) or (num, 3), not below 0. Where the values
-        of the envelope are not known, as inside `jax.jit`, that of the first component is taken for all.
+        of the envelope are not known, as inside `jax.jit`, all splats get the envelope of the first component.
         Raises ValueError for any other mixture or color.
 
         Example: `FoldedSplats.from_mixture(mixture, color=[1.0, 0.5, 0.0]).at(0.5)`.

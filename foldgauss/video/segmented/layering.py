@@ -213,6 +213,6 @@ def _concatenate(parts: list[FoldedSplats]) -> FoldedSplats:
         return dataclasses.replace(part, coefficients=coefficients, path_index=None, paths=None)
 
     path_index, paths = join_paths(parts)
-    # The numbers of the envelope are those of all parts, see `_check_alike`.
+    # All parts have the same envelope, see `_check_alike`.
     joined = jax.tree.map(lambda one, *others: jnp.concatenate([one, *others]) if one.ndim else one, *map(pad, parts))
     return dataclasses.replace(joined, path_index=path_index, paths=paths)

@@ -45,8 +45,8 @@ _FIELDS = FitState.array_fields()
 class HeldArrays:
     """The arrays of a `FitState` on a device. The next step consumes them.
 
-    `on_host`: those of `ON_HOST`, fetched; read-only, as a change in place would be lost. `finite`: of `rows` and
-    `second`, whether all values are.
+    `on_host`: the arrays named in `ON_HOST`, on the host; they are read-only, since the next step would discard a
+    change in place. `finite`: whether all values of `rows` and of `second` are finite.
     """
 
     def __init__(
