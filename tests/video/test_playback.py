@@ -100,6 +100,7 @@ def test_all_ways_refuse_the_same(entrance, change, how, message):
         (lambda model: model, {"t": 1 + 5e-7}),
         (lambda model: model, {"t": np.float64(-5e-7)}),
         (lambda model: model, {"t": 1}),
+        (lambda model: model, {"size": (np.int64(30), np.int32(41))}),
         (lambda model: model.with_options(RenderOptions(tile_size=8)), {}),
         (_without_gaussians, {}),
     ],

@@ -270,7 +270,7 @@ class FitState:
         self.__dict__.update(held.on_host, held=held)
 
     def fetch_all(self) -> None:
-        """Fetch all arrays, also those of `last_finite`; arrays that were assigned meanwhile are kept.
+        """Fetch the arrays of this state and of `last_finite`. An array that was assigned is kept instead.
 
         The next step sends them to the device again. Without a device there is nothing to do.
         """
