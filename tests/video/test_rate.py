@@ -25,7 +25,7 @@ from foldgauss.video.compression.quantizer import Worth, bit_price, round_groups
 from foldgauss.video.fitting.compress import ROUNDING_QUALITY
 from foldgauss.video.fitting.config import DEFAULT_QUALITY
 from foldgauss.video.fitting.loop import finish, start
-from foldgauss.video.fitting.rate import ACTIONS, HEADER_BYTES, RateControl, _bracket, _last, count_bytes, count_past
+from foldgauss.video.fitting.rate import ACTIONS, HEADER_BYTES, RateControl, _last, count_bytes, count_past
 from foldgauss.video.fitting.state import FitState, to_model
 from foldgauss.video.models.row_layout import COLOR, GROUPS, SHAPE, TRAJECTORY, columns, group_bits
 
@@ -241,8 +241,7 @@ def test_a_size_below_that_of_one_gaussian_is_refused_at_the_start():
 
 def test_the_last_number_is_found_to_half_a_percent_of_all():
     for wanted in (0, 1, 7, 100, 1234, 5000):
-        last, after = _bracket(lambda num, wanted=wanted: num <= wanted, 5000)
-        assert last <= wanted < after <= last + 25
+        assert wanted - 25 <= _last(lambda num, wanted=wanted: num <= wanted, 0, 5000, 25.0) <= wanted
 
 
 def test_a_larger_size_is_used_for_a_better_model():
@@ -281,6 +280,20 @@ def test_a_psnr_within_reach_is_reached_by_a_file_that_is_hardly_larger_than_tha
     made = fit(frames, dataclasses.replace(config, quality=None, psnr=wanted))
     assert evaluate(made.model, frames).mean_psnr >= wanted - TOLERATED_DB
     assert count_bytes(made.quantized) < 1.1 * count_bytes(given.quantized)
+
+
+def test_gaussians_are_added_where_a_psnr_is_out_of_reach():
+    config, wanted = dataclasses.replace(CONFIG, num_gaussians=25, steps=400, quality=None), 31.0
+    grown, kept, sized = (
+        fit(FRAMES, dataclasses.replace(config, psnr=wanted, **limit), every=1)
+        for limit in ({}, {"max_gaussians": 25}, {"size_mb": 1.0})
+    )
+    numbers = [info.num_gaussians for info in grown.history]
+    assert 2 * 25 < max(numbers) <= 8 * 25
+    assert all(later <= 2 * before for before, later in itertools.pairwise(numbers))
+    assert max(info.num_gaussians for one in (kept, sized) for info in one.history) == 25
+    reached, missed = (evaluate(one.model, FRAMES).mean_psnr for one in (grown, kept))
+    assert missed < wanted - 1 < wanted - TOLERATED_DB <= reached
 
 
 def test_a_coarseness_is_searched_from_the_finest_one():

@@ -58,7 +58,7 @@ def test_new_gaussians_are_where_errors_are():
     before = state.copy()
     state.frame_errors[:] = 1e-12
     state.frame_errors[4] = 0.1
-    relocate(state, FRAMES, CONFIG.replace(**{"strategy.relocated_fraction": 0.2}), SPEC, motion_finder(FRAMES)())
+    relocate(state, FRAMES, CONFIG.replace(**{"strategy.relocated_fraction": 0.2}), motion_finder(FRAMES)())
     assert state.num_gaussians == CONFIG.num_gaussians
     new = state.counts == 0
     assert new.sum() == 60
@@ -79,7 +79,7 @@ def test_new_gaussians_are_in_the_chunk_of_those_behind_them():
     """Where a long step leads past both the sorting into chunks and the relocation."""
     state = fitted_state()
     state.chunks = np.repeat(np.array([7, 3, 0], np.uint16), 100)
-    relocate(state, FRAMES, CONFIG.replace(**{"strategy.relocated_fraction": 0.1}), SPEC, None)
+    relocate(state, FRAMES, CONFIG.replace(**{"strategy.relocated_fraction": 0.1}), None)
     new = np.flatnonzero(state.counts == 0)
     assert len(new) == 30
     assert state.chunks.dtype == np.uint16
@@ -92,7 +92,7 @@ def test_only_gaussians_that_can_be_judged_move():
     state = fitted_state()
     state.counts[:280] = 4
     before = state.rows.copy()
-    relocate(state, FRAMES, CONFIG.replace(**{"strategy.relocated_fraction": 0.5}), SPEC, None)
+    relocate(state, FRAMES, CONFIG.replace(**{"strategy.relocated_fraction": 0.5}), None)
     kept = {row.tobytes() for row in state.rows}
     assert all(row.tobytes() in kept for row in before[:280])
     assert sum(row.tobytes() in kept for row in before) == 290
@@ -101,7 +101,7 @@ def test_only_gaussians_that_can_be_judged_move():
 def test_few_gaussians_are_not_relocated():
     state = fitted_state()
     before = state.rows.copy()
-    relocate(state, FRAMES, CONFIG.replace(**{"strategy.relocated_fraction": 0.01}), SPEC, None)
+    relocate(state, FRAMES, CONFIG.replace(**{"strategy.relocated_fraction": 0.01}), None)
     np.testing.assert_array_equal(state.rows, before)
 
 
@@ -112,7 +112,7 @@ def test_gaussians_alive_in_no_frame_move_first():
     state.rows[between, at["time_loc_logit"].start] = 0  # t = 0.5 lies between two frames
     state.counts[between] = 0
     before = state.rows[between].copy()
-    relocate(state, FRAMES, CONFIG.replace(**{"strategy.relocated_fraction": 0.05}), SPEC, None)
+    relocate(state, FRAMES, CONFIG.replace(**{"strategy.relocated_fraction": 0.05}), None)
     kept = {row.tobytes() for row in state.rows}
     assert not any(row.tobytes() in kept for row in before)
 

@@ -577,7 +577,7 @@ def quantize_chunk(
     return Chunk(bits, columns)
 
 
-def select_rows(exact: ExactColumns, kept: Bool[np.ndarray, " num"]) -> ExactColumns:
+def select_rows(exact: ExactColumns, kept: Bool[np.ndarray, " num"] | Int[np.ndarray, " kept"]) -> ExactColumns:
     """Some of a model's Gaussians, in their order."""
     values = {name: value[kept] for name, value in exact.values.items()}
     path = None if exact.path is None else exact.path[kept]

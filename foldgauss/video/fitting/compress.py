@@ -62,14 +62,14 @@ def compress(
         strategy=Strategy(relocated_fraction=0.0, scale_cutoff=model.scale_cutoff),
         views=Views(interpolation_fraction=0.0),
     )
+    if not config.is_compact:
+        config = dataclasses.replace(config, quality=ROUNDING_QUALITY if frames is None else DEFAULT_QUALITY)
     if frames is None:
         for name, value in (("psnr", psnr), ("steps", steps), ("minutes", minutes)):
             require(value is None, name, expected="none without the clip", got=value, cure="Give the clip, too.")
         return _round_only(model, config)
     check_frames_of(model, frames)
     check_frames(frames)
-    if not config.is_compact:
-        config = dataclasses.replace(config, quality=DEFAULT_QUALITY)
     budget = planned_steps(dataclasses.replace(config, minutes=None), len(frames))
     state = start_from(model, config, steps or math.ceil((1 - COMPRESSION_START) * budget), COMPRESSION_START)
     config = dataclasses.replace(config, steps=state.plan if steps else None)
@@ -77,8 +77,6 @@ def compress(
 
 
 def _round_only(model: VideoModel, config: FitConfig) -> FitResult:
-    if not config.is_compact:
-        config = dataclasses.replace(config, quality=ROUNDING_QUALITY)
     background = None if model.compositing == "over" else BLACK  # alpha is kept, whatever clip the model is of
     control = RateControl(np.stack(list(VideoRenderer(model, background=background).frames())), config)
     state = start_from(model, config, 1)

@@ -623,17 +623,11 @@ def default_num_gaussians(
     number is the smallest of three, where a core has x microseconds for each pixel of all frames, p pixels each:
     `DENSITY` x^`DENSITY_POWER` lifetime^`LIFETIME_POWER` for each pixel of all frames; the number of which `ALIVE`
     x^`ALIVE_POWER` p^`ALIVE_PIXEL_POWER`, at most `MOST_PER_PIXEL` p, are alive in a frame; and the number whose
-    parameters, with `PARAMETER_BYTES` each, take as many bytes as the frames. x is the time that `steps` take, or
-    `minutes` times the number of `threads` (default: those of this process).
+    parameters, with `PARAMETER_BYTES` each, take as many bytes as the frames. `threads`: see `time_per_pixel`.
     """
     area = height * width
     pixels = num_frames * area
-    steps, budgets = planned_steps(config, num_frames), []  # in microseconds for each pixel of all frames
-    if steps is not None:
-        budgets.append(PIXEL_TIME * steps * config.views.batch_size / num_frames)
-    if config.minutes is not None:
-        budgets.append(60e6 * config.minutes * (threads or num_threads()) / pixels)
-    time = min(budgets)
+    time = time_per_pixel(config, num_frames, height, width, threads)
     by_time = DENSITY * time**DENSITY_POWER * lifetime**LIFETIME_POWER * pixels
     alive = min(ALIVE * time**ALIVE_POWER * area**ALIVE_PIXEL_POWER, MOST_PER_PIXEL * area)
     by_life = alive * num_frames / lifetime
@@ -641,16 +635,25 @@ def default_num_gaussians(
     return max(round(min(by_time, by_life, by_size, _most_for_rate(config, pixels, time))), 1)
 
 
+def time_per_pixel(config: FitConfig, num_frames: int, height: int, width: int, threads: int | None = None) -> float:
+    """Microseconds of a core for each pixel of all frames: x of `default_num_gaussians`.
+
+    It is the time that `steps` take, or `minutes` times the number of `threads` (default: those of this process).
+    """
+    steps = planned_steps(config, num_frames)
+    by_steps = math.inf if steps is None else PIXEL_TIME * steps * config.views.batch_size / num_frames
+    minutes = math.inf if config.minutes is None else config.minutes * (threads or num_threads())
+    return min(by_steps, 60e6 * minutes / (num_frames * height * width))
+
+
 def _most_for_rate(config: FitConfig, pixels: int, time: float) -> float:
     """A few times as many Gaussians as a compact model usually keeps, whose number depends on the clip."""
-    limits = [START_PER_TIME * time * pixels if config.is_compact else math.inf]
-    if config.quality is not None:
-        limits.append(pixels * START_DENSITY * 2 ** (DENSITY_PER_QUALITY * (config.quality - 50)))
-    if config.psnr is not None:  # at what quality is not known yet
-        limits.append(pixels * START_DENSITY * 2 ** (DENSITY_PER_DB * (config.psnr - PSNR_AT_50)))
-    if config.size_mb is not None:
-        limits.append(GAUSSIANS_PER_MB * config.size_mb)
-    return min(limits)
+    if not config.is_compact:
+        return math.inf
+    by_quality = math.inf if config.quality is None else DENSITY_PER_QUALITY * (config.quality - 50)
+    by_psnr = math.inf if config.psnr is None else DENSITY_PER_DB * (config.psnr - PSNR_AT_50)  # the quality is unknown
+    by_size = math.inf if config.size_mb is None else GAUSSIANS_PER_MB * config.size_mb
+    return min(START_PER_TIME * time * pixels, START_DENSITY * 2 ** min(by_quality, by_psnr) * pixels, by_size)
 
 
 def chosen_num_gaussians(config: FitConfig, num_frames: int, height: int, width: int, **known: float | None) -> int:

@@ -213,11 +213,12 @@ def _make_controls(
 ) -> list[DensityControl]:
     """What the settings ask for."""
     controls: list[DensityControl] = []
+    followed = find_motion if config.follows_motion else lambda: None
     if config.is_compact:
-        controls.append(RateControl(frames, config))
+        controls.append(RateControl(frames, config, followed))
         controls[0].check_size(state)
     if relocates(config):
-        controls.append(Relocation(frames, config, find_motion))
+        controls.append(Relocation(frames, config, followed))
     if config.strategy.growth is not None:
         controls.append(Densification(config, frames.shape[1:3]))
     return controls

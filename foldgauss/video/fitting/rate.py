@@ -4,7 +4,7 @@ The objective is $D + \lambda R$: D the squared error in levels of 8 bits, summe
 compact file. Two actions reduce it while the others adapt, at stated fractions of the plan (`ACTIONS`):
 
 * Gaussians are dropped whose removal adds less squared error than $\lambda$ times their bits, and the others are sorted
-  by cells of space and time, which saves bits.
+  by cells of space and time, which saves bits. Where a PSNR is asked for that is out of reach, Gaussians are added.
 * In the last part the parameters of ever more Gaussians are rounded and no longer trained: shapes first, then
   trajectories, then colors. A step of rounding is as coarse as $\lambda$ makes it worth, see `compression.quantizer`.
 
@@ -14,6 +14,7 @@ theory of rate and distortion at high resolution (Gish and Pierce 1968); for the
 """
 
 import dataclasses
+import functools
 import math
 import time
 from collections.abc import Callable
@@ -21,9 +22,10 @@ from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
+from scipy.optimize import brentq
 
 from foldgauss._numerics.random_streams import Stream, make_generator
-from foldgauss._runtime.checks import invalid
+from foldgauss._runtime.checks import require
 from foldgauss.video.compression.chunks import arrange, divide_anew
 from foldgauss.video.compression.quantize import (
     Quantized,
@@ -45,8 +47,9 @@ from foldgauss.video.compression.quantizer import (
 )
 from foldgauss.video.compression.streams import encode_chunk, encode_motion
 from foldgauss.video.fitting.budget import measure_progress
-from foldgauss.video.fitting.config import FitConfig
+from foldgauss.video.fitting.config import START_PER_TIME, FitConfig, most_gaussians, time_per_pixel
 from foldgauss.video.fitting.density_control import DensityControl
+from foldgauss.video.fitting.relocation import add, errors_are_known
 from foldgauss.video.fitting.schedule import count_passes
 from foldgauss.video.fitting.state import FitState, running_psnr, to_model
 from foldgauss.video.models.background import BLACK, WHITE, Background, composite
@@ -54,6 +57,7 @@ from foldgauss.video.models.metrics import psnr as psnr_of
 from foldgauss.video.models.renderer import VideoRenderer
 from foldgauss.video.models.row_layout import COLOR, GROUPS, SHAPE, TRAJECTORY, columns, pack
 from foldgauss.video.models.video_model import VideoModel
+from foldgauss.video.motion.optical_flow import Motion
 
 #: Coarseness, the binary logarithm of the factor of all steps, at quality 0. Up to quality 100 it is linear.
 COARSEST = 11.0
@@ -70,12 +74,8 @@ BYTES_PER_STREAM = 8
 #: Fraction of the largest file that the fit aims at; the Gaussians that are worth least are dropped in the end if the
 #: file is larger nevertheless.
 _AIM = 0.98
-#: Tries of the coarseness for a size, at most: each codes all Gaussians.
-_TRIES = 8
-#: The binary logarithm by which a file may be smaller than asked for: it changes by more until the end of the fit.
-_TOLERANCE_LOG2 = 0.02
-#: By how much the binary logarithm of a size falls for each unit of coarseness, as measured.
-_SLOPE_LOG2 = 0.8
+#: How finely the coarseness is searched for a size, which changes by more until the end of the fit: 1% of the bytes.
+_TOLERANCE_OF_SIZE = 0.02
 #: By how many dB dropping has to worsen the images at once for what remains of it to be measured.
 _LEAST_MEASURED_DB = 0.05
 #: The coarseness of dropping where no PSNR can be spared.
@@ -117,8 +117,6 @@ _SPEEDUP = 2.0
 _MARGIN_DB = 0.3
 #: Bits of a Gaussian in a file whose number of Gaussians suits its steps, as measured.
 USUAL_BITS = 75.0
-#: The coarseness that the search for a size starts with.
-USUAL_COARSENESS = 6.0
 #: The least fraction of the Gaussians that remains: each is judged as if the others remained.
 _LEAST_KEPT = 0.45
 #: Squared error that sorting may add, as a fraction of the model's own, which many passes compensate for.
@@ -128,7 +126,7 @@ _PASSES = 40.0
 #: The least fraction of the price of a bit at which Gaussians are dropped where nothing makes up for them.
 _LEAST_FRACTION = 1e-4
 #: Tries of the number of Gaussians that are dropped in the end.
-_TRIALS = 9
+_TRIALS = 10
 #: Squared error that sorting may add without training, as a fraction of the variance of the images.
 _ORDERING_UNTRAINED = 1e-5
 
@@ -172,21 +170,21 @@ class RateControl(DensityControl):
 
     plans_time = True
 
-    def __init__(self, frames: np.ndarray, config: FitConfig):
-        self.frames, self.config = frames, config
+    def __init__(self, frames: np.ndarray, config: FitConfig, find_motion: Callable[[], Motion | None] = lambda: None):
+        self.frames, self.config, self.find_motion = frames, config, find_motion
         self.trimming = {"psnr": 0.0, "size_mb": 0.0}  # seconds that the last dropping takes for each
         self.background = BEYOND_BLACK if frames.shape[-1] == 4 else np.float32(BLACK)
         self.sampled = np.unique(np.linspace(0, len(frames) - 1, _SAMPLED_FRAMES).round().astype(int))
 
     def check_size(self, state: FitState) -> None:
         """Raise ValueError if a file of a single Gaussian is larger than the settings allow."""
-        if self.config.size_mb is None:
+        size = self.config.size_mb
+        if size is None:
             return
         exact, one = compute_columns(self._model(state)), np.arange(state.num_gaussians) == 0
         rules = {name: Rule(0.0, COARSEST) for name in column_names(self.config.fold_degree) if not is_integral(name)}
         least = count_bytes(quantize(select_rows(exact, one), np.zeros(1, np.int32), rules)) / 1e6
-        if least > self.config.size_mb:
-            raise invalid("size_mb", expected=f"at least {least:.4f} for this clip", got=self.config.size_mb)
+        require(least <= size, "size_mb", expected=f"at least {least:.4f} for this clip", got=size)
 
     def is_due(self, state: FitState) -> bool:
         left = ACTIONS[state.rate_actions :]
@@ -248,18 +246,20 @@ class RateControl(DensityControl):
             return whole
         worst_first = np.argsort(Worth(dequantize(whole), self.background).removal, kind="stable")
 
-        def without(num: int) -> Quantized:
-            kept = np.ones(len(worst_first), bool)
-            kept[worst_first[:num]] = False
+        def without(num: float) -> Quantized:
+            kept = np.sort(worst_first[int(num) :])
             return quantize(select_rows(exact, kept), classes[kept], rules, state.chunks[kept])
 
-        most, dropped = len(worst_first) - 1, 0
-        frames = np.arange(len(self.frames))
-        if self.config.psnr is not None and self._psnr(dequantize(whole), frames) > self.config.psnr:
+        def is_too_large(num: float) -> bool:
+            return count_bytes(without(num)) > 1e6 * self.config.size_mb
+
+        most, dropped, frames = len(worst_first) - 1, 0, np.arange(len(self.frames))
+        spread = max(most / 200, 1.0)  # how finely the number is searched
+        if self.config.psnr is not None:
             reaches = lambda num: self._psnr(dequantize(without(num)), frames) >= self.config.psnr  # noqa: E731
-            dropped = _bracket(reaches, most)[0]
-        if self.config.size_mb is not None and count_bytes(without(dropped)) > 1e6 * self.config.size_mb:
-            dropped = min(_bracket(lambda num: count_bytes(without(num)) > 1e6 * self.config.size_mb, most)[1], most)
+            dropped = int(_last(reaches, 0, most, spread))
+        if self.config.size_mb is not None and is_too_large(dropped):
+            dropped = min(int(_last(is_too_large, dropped, most, spread) + spread), most)
         return without(dropped) if dropped else whole
 
     def _adaptation(self, state: FitState, action: Action) -> float:
@@ -279,7 +279,25 @@ class RateControl(DensityControl):
         state.keep(order)
         state.chunks = chunks.astype(np.uint16)
 
+    def _count_missing(self, state: FitState, action: Action) -> int:
+        """How many Gaussians a PSNR needs besides those that there are; 0 if the rest of the fit may reach it alone."""
+        config, num, shape = self.config, state.num_gaussians, self.frames.shape[:3]
+        is_only_goal = config.psnr is not None and (config.quality, config.size_mb) == (None, None)
+        if not is_only_goal or action.progress >= _TRUSTED_FROM or not errors_are_known(state, config):
+            return 0
+        missing = (
+            config.psnr + _MARGIN_DB - self._psnr(self._model(state), self.sampled) - 2 * self._gain(state, action)
+        )
+        needed = num * 2 ** min(max(missing, 0.0), 1.0)  # as if twice as many raised it by 1 dB
+        most = 2 * START_PER_TIME * time_per_pixel(config, *shape) * math.prod(shape)
+        return round(min(needed, most, most_gaussians(config))) - num
+
     def _drop(self, state: FitState, action: Action) -> None:
+        missing = self._count_missing(state, action)
+        if missing > 0:
+            state.coarseness = state.coarseness or FINEST
+            add(missing, state, self.frames, self.config, self.find_motion())
+            return
         model = self._model(state)
         worth = Worth(model, self.background)
         coarseness = self._choose_coarseness(state, worth, action)
@@ -336,13 +354,16 @@ class RateControl(DensityControl):
             return max(measured.coarseness_for(num, action.extent), FINEST)
         streams = max(room - HEADER_BYTES, 64.0)
 
+        @functools.cache
         def excess(coarseness: float) -> float:
             begun = time.perf_counter()
             num_bytes = count_bytes(measured.quantize(coarseness, state.chunks)) - HEADER_BYTES
             self.trimming["size_mb"] = _TRIALS * (time.perf_counter() - begun)
             return math.log2(num_bytes / streams)
 
-        return _solve(excess, state.coarseness or USUAL_COARSENESS)
+        if excess(COARSEST) > 0:
+            return COARSEST
+        return FINEST if excess(FINEST) <= 0 else brentq(excess, FINEST, COARSEST, xtol=_TOLERANCE_OF_SIZE)
 
     def _solve_psnr(self, state: FitState, measured: Worth | Quantizer, action: Action) -> float:
         """The coarseness for the PSNR that is asked for.
@@ -353,8 +374,7 @@ class RateControl(DensityControl):
         """
         aim, drops = self.config.psnr + _MARGIN_DB, action.what == "drop"
         adaptation = self._adaptation(state, action)
-        gain = min(action.gain, _GAIN_OF_GIVEN) if _is_given(state) else action.gain
-        gain *= float((self._seen_errors(state) > _PERFECT).mean())  # the PSNR of perfect frames does not rise
+        gain = self._gain(state, action)
         now = self._psnr(self._with_only(state, np.ones(state.num_gaussians, bool)), self.sampled)
 
         def coarsest(most: float, low: float, high: float) -> float:
@@ -371,10 +391,8 @@ class RateControl(DensityControl):
             return _last(is_reached, low, max(low, min(high, COARSEST)))
 
         if not drops:
-            low, high = FINEST, COARSEST
-            if state.coarseness:
-                low = max(state.coarseness - _MOST_FINER, FINEST)
-                high = state.coarseness + (now + gain - aim) / _DB_PER_UNIT
+            low = max(state.coarseness - _MOST_FINER, FINEST)
+            high = state.coarseness + (now + gain - aim) / _DB_PER_UNIT if state.coarseness else COARSEST
             return coarsest(_MOST_ROUNDED_DB, low, high)
         most = _most_dropped_db(state, self._psnr(self._model(state), self.sampled))
         sure_gain = gain if state.rules else _SURE * gain
@@ -383,6 +401,10 @@ class RateControl(DensityControl):
             return sure
         spare = max(2 * (now + gain - aim), _RISKED_DB if action.progress < _TRUSTED_FROM else 0.0)
         return coarsest(min(spare, most), sure, self._usual_coarseness(state, measured, action))
+
+    def _gain(self, state: FitState, action: Action) -> float:
+        gain = min(action.gain, _GAIN_OF_GIVEN) if _is_given(state) else action.gain
+        return gain * float((self._seen_errors(state) > _PERFECT).mean())  # the PSNR of perfect frames does not rise
 
     def _with_only(self, state: FitState, kept: Bool[np.ndarray, " num"]) -> VideoModel:
         """The model of some Gaussians, as rounded as it will be once the rules are chosen."""
@@ -452,13 +474,13 @@ def count_past(progress: float) -> int:
     return sum(action.progress < progress for action in ACTIONS)
 
 
-def _last(holds: Callable[[float], bool], low: float, high: float) -> float:
+def _last(holds: Callable[[float], bool], low: float, high: float, tolerance: float = _TOLERANCE) -> float:
     """About the largest number from `low` to `high` up to which a condition holds; `low` if it does nowhere."""
     if high <= low or not holds(low):  # far beyond, a clip with empty frames may have them perfect again
         return low
     if holds(high):
         return high
-    while high - low > _TOLERANCE:
+    while high - low > tolerance:
         middle = (low + high) / 2
         low, high = (middle, high) if holds(middle) else (low, middle)
     return low
@@ -484,25 +506,3 @@ def _is_given(state: FitState) -> bool:
 
 def _decode_rules(state: FitState) -> dict[str, Rule]:
     return {name: Rule(*numbers) for name, *numbers in state.rules}
-
-
-def _solve(excess: Callable[[float], float], guess: float) -> float:
-    """The coarseness at which a size, as a binary logarithm, is not exceeded: near the guess, then by bisection."""
-    low, high, at = FINEST, COARSEST, min(max(guess, FINEST), COARSEST)
-    for number in range(_TRIES):
-        now = excess(at)
-        low, high = (at, high) if now > 0 else (low, at)
-        if -_TOLERANCE_LOG2 <= now <= 0 or (now <= 0 and at == FINEST):
-            return at
-        nearby = at + now / _SLOPE_LOG2
-        at = min(max(nearby, low), high) if number == 0 else (low + high) / 2
-    return high
-
-
-def _bracket(holds: Callable[[int], bool], most: int) -> tuple[int, int]:
-    """Two numbers, some `most` / 200 apart, around the one up to which a condition holds; it holds for the lower."""
-    low, high = 0, most + 1
-    while high - low > max(most // 200, 1):
-        middle = (low + high) // 2
-        low, high = (middle, high) if holds(middle) else (low, middle)
-    return low, high

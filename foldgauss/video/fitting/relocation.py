@@ -6,7 +6,7 @@ The number of Gaussians stays the same. Source: relocation of dead Gaussians in 
 
 import dataclasses
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import cv2
 import numpy as np
@@ -29,7 +29,7 @@ from foldgauss.video.fitting.initialize import (
 from foldgauss.video.fitting.schedule import steps_per_pass, to_planes
 from foldgauss.video.fitting.state import FitState, envelope_of, frame_times, paths_of, spec_of
 from foldgauss.video.models.background import random_background
-from foldgauss.video.models.conditioning import ConditioningSpec, condition, find_windows
+from foldgauss.video.models.conditioning import condition, find_windows
 from foldgauss.video.models.row_layout import columns, pack
 from foldgauss.video.motion.optical_flow import Motion
 
@@ -55,39 +55,53 @@ def relocates(config: FitConfig) -> bool:
 class Relocation(DensityControl):
     """Relocation at the fractions `RELOCATED_AT` of the plan, after a pass at least, in fits that have not diverged."""
 
-    def __init__(self, frames: np.ndarray, config: FitConfig, find_motion: Callable[[], Motion]):
+    def __init__(self, frames: np.ndarray, config: FitConfig, find_motion: Callable[[], Motion | None]):
         self.frames, self.config, self.find_motion = frames, config, find_motion
 
     def is_due(self, state: FitState) -> bool:
-        if not state.plan or state.step < steps_per_pass(self.config, len(self.frames)):
+        if not state.plan or not errors_are_known(state, self.config):
             return False
         before, after = (measure_progress(state, self.config, step) for step in (state.step - 1, state.step))
-        crossed = any(before < fraction <= after for fraction in RELOCATED_AT)
-        is_good = not state.backoffs and state.is_finite("rows") and state.is_finite("second")
-        return crossed and bool(state.frame_errors.any()) and is_good
+        return any(before < fraction <= after for fraction in RELOCATED_AT)
 
     def apply(self, state: FitState) -> None:
-        motion = self.find_motion() if self.config.follows_motion else None
-        spec = spec_of(self.config, self.frames.shape[1:3])
-        relocate(state, self.frames, self.config, spec, motion)
+        relocate(state, self.frames, self.config, self.find_motion())
 
 
-def relocate(
-    state: FitState, frames: np.ndarray, config: FitConfig, spec: ConditioningSpec, motion: Motion | None
-) -> None:
-    """Move the fraction `relocated_fraction` of the Gaussians that can be judged; their moments start at zero.
+def errors_are_known(state: FitState, config: FitConfig) -> bool:
+    """Whether all frames were seen, by a fit that has not diverged."""
+    return (
+        state.step >= steps_per_pass(config, len(state.frame_errors))
+        and bool(state.frame_errors.any())
+        and not state.backoffs
+        and state.is_finite("rows")
+        and state.is_finite("second")
+    )
 
-    Frames and pixels of the new ones are drawn by squared error. `spec` is that of whole frames.
-    """
-    times = np.asarray(frame_times(state.time_logits))
-    influence = measure_influence(state, find_windows(state.rows, spec), times, config.fold_degree)
+
+def relocate(state: FitState, frames: np.ndarray, config: FitConfig, motion: Motion | None) -> None:
+    """Move the fraction `relocated_fraction` of the Gaussians that can be judged."""
+    times, window = frame_times(state.time_logits), find_windows(state.rows, spec_of(config, frames.shape[1:3]))
+    influence = measure_influence(state, window, np.asarray(times), config.fold_degree)
     num = round(config.strategy.relocated_fraction * np.isfinite(influence).sum())
-    if num < _LEAST_RELOCATED:
-        return
-    stay = np.ones(len(state.rows), bool)
-    stay[np.argsort(influence, kind="stable")[:num]] = False
-    new = make_newborns(num, state, frames, state.frame_errors.astype(float), config, spec, motion)
-    state.keep(np.flatnonzero(stay))
+    if num >= _LEAST_RELOCATED:
+        add(num, state, frames, config, motion, instead_of=np.argsort(influence, kind="stable")[:num])
+
+
+def add(
+    num: int,
+    state: FitState,
+    frames: np.ndarray,
+    config: FitConfig,
+    motion: Motion | None,
+    instead_of: Sequence[int] = (),
+) -> None:
+    """Add `num` Gaussians, at frames and pixels drawn by squared error, in place of those of some indices.
+
+    Their moments start at zero.
+    """
+    new = make_newborns(num, state, frames, config, motion)
+    state.keep(np.delete(np.arange(state.num_gaussians), instead_of))
     at = columns(config.fold_degree)["time_loc_logit"].start  # depth: among those of their time, which are in its order
     place = np.searchsorted(np.sort(state.rows[:, at]), new[:, at])
     order = np.argsort(np.concatenate([np.arange(len(state.rows)) + 0.5, place]), kind="stable")
@@ -119,17 +133,13 @@ def make_newborns(
     num: int,
     state: FitState,
     frames: UInt8[np.ndarray, "num_frames height width channels"],
-    errors: Float[np.ndarray, " num_frames"],
     config: FitConfig,
-    spec: ConditioningSpec,
     motion: Motion | None,
 ) -> Float32[np.ndarray, "num width"]:
-    """Packed rows of `num` Gaussians, at frames and positions drawn by squared error, with the colors of the clip.
-
-    `errors` are the squared errors of the frames, up to a common factor; `spec` is that of whole frames.
-    """
+    """Packed rows of `num` Gaussians, at frames and positions drawn by squared error, with the colors of the clip."""
     rng = make_generator(Stream.BIRTH, state.step, seed=config.seed)
-    times, window, paths = np.asarray(frame_times(state.time_logits)), find_windows(state.rows, spec), paths_of(state)
+    times, paths, spec = np.asarray(frame_times(state.time_logits)), paths_of(state), spec_of(config, frames.shape[1:3])
+    window, errors = find_windows(state.rows, spec), state.frame_errors.astype(float)
     spec, colors = dataclasses.replace(spec, paths=paths), np.ascontiguousarray(frames[..., :3])
     home = np.sort(rng.choice(len(frames), num, p=errors / errors.sum()))
 
