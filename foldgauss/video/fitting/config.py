@@ -604,8 +604,9 @@ DENSITY_PER_DB = 0.2
 #: Gaussians per pixel of a clip for each microsecond of x, see `default_num_gaussians`, with which a fit of a compact
 #: model starts at most: those that do not converge are not worth their bits.
 START_PER_TIME = 7e-4
-#: Gaussians that a fit starts with for each 10^6 bytes of the largest file: some three times as many as it keeps.
-GAUSSIANS_PER_MB = 300_000
+#: Gaussians that a fit starts with for each 10^6 bytes of the largest file, where there is time: some ten times as many
+#: as it keeps.
+GAUSSIANS_PER_MB = 1_000_000
 
 
 def default_num_gaussians(

@@ -71,9 +71,6 @@ BYTES_PER_DEGREE = 80
 BYTES_PER_CHUNK = 110
 #: Bytes of the header for the length of a stream.
 BYTES_PER_STREAM = 8
-#: Fraction of the largest file that the fit aims at; the Gaussians that are worth least are dropped in the end if the
-#: file is larger nevertheless.
-_AIM = 0.98
 #: How finely the coarseness is searched for a size, which changes by more until the end of the fit: 1% of the bytes.
 _TOLERANCE_OF_SIZE = 0.02
 #: By how many dB dropping has to worsen the images at once for what remains of it to be measured.
@@ -348,7 +345,7 @@ class RateControl(DensityControl):
 
     def _solve_size(self, state: FitState, measured: Worth | Quantizer, action: Action) -> float:
         """The coarseness for the largest file: by the number of Gaussians that it holds, and for rounding by coding."""
-        room = _AIM * 1e6 * self.config.size_mb
+        room = 1e6 * self.config.size_mb
         if action.what == "drop":  # at first more than it holds
             num = 8 * max(room - HEADER_BYTES, 0.0) / USUAL_BITS / math.sqrt(action.extent)
             return max(measured.coarseness_for(num, action.extent), FINEST)
