@@ -276,7 +276,7 @@ def test_limits_bound_the_start():
     config = FitConfig(num_gaussians=500, max_gaussians=300)
     assert chosen_num_gaussians(config, 5, 24, 40) == 300
     by_size = dataclasses.replace(config, num_gaussians=None, size_mb=1e-4)
-    assert chosen_num_gaussians(by_size, 5, 24, 40) == 30
+    assert chosen_num_gaussians(by_size, 5, 24, 40) == 100
     assert chosen_num_gaussians(dataclasses.replace(config, max_gaussians=None), 5, 24, 40) == 500
     assert len(start(FRAMES, config).rows) == 300
 
