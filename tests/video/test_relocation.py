@@ -9,7 +9,7 @@ from clips import moving_blobs
 
 from foldgauss.render import cpu
 from foldgauss.video import FitConfig, Growth, LearningRates, Strategy, Views, evaluate, fit, fit_steps
-from foldgauss.video.fitting.relocation import RELOCATED_AT, Relocation, measure_influence, relocate
+from foldgauss.video.fitting.relocation import RELOCATED_AT, Relocation, add, measure_influence, relocate
 from foldgauss.video.fitting.schedule import COLD, choose_views, learning_rates, steps_per_pass
 from foldgauss.video.fitting.state import frame_times
 from foldgauss.video.fitting.steppers.cpu_stepper import CpuStepper
@@ -85,6 +85,15 @@ def test_new_gaussians_are_in_the_chunk_of_those_behind_them():
     assert state.chunks.dtype == np.uint16
     assert (state.chunks[1:] <= state.chunks[:-1]).all()
     assert len(set(state.chunks[new])) == 3
+
+
+def test_gaussians_can_be_added_beside_the_others():
+    state = fitted_state()
+    before = [row.tobytes() for row in state.rows]
+    add(30, state, FRAMES, CONFIG, None)
+    new = state.counts == 0
+    assert (state.num_gaussians, new.sum()) == (330, 30)
+    assert [row.tobytes() for row in state.rows[~new]] == before
 
 
 def test_only_gaussians_that_can_be_judged_move():
