@@ -59,10 +59,10 @@ class Relocation(DensityControl):
         self.frames, self.config, self.find_motion = frames, config, find_motion
 
     def is_due(self, state: FitState) -> bool:
-        if not state.plan or not errors_are_known(state, self.config):
+        if not state.plan:
             return False
         before, after = (measure_progress(state, self.config, step) for step in (state.step - 1, state.step))
-        return any(before < fraction <= after for fraction in RELOCATED_AT)
+        return any(before < part <= after for part in RELOCATED_AT) and errors_are_known(state, self.config)
 
     def apply(self, state: FitState) -> None:
         relocate(state, self.frames, self.config, self.find_motion())
