@@ -639,7 +639,8 @@ def default_num_gaussians(
 def time_per_pixel(config: FitConfig, num_frames: int, height: int, width: int, threads: int | None = None) -> float:
     """Microseconds of a core for each pixel of all frames: x of `default_num_gaussians`.
 
-    It is the time that `steps` take, or `minutes` times the number of `threads` (default: those of this process).
+    The time is `minutes` times the number of `threads`, by default those of this process. With `steps`, it is
+    `PIXEL_TIME` for each frame of each step. If both are given, the smaller one counts.
     """
     steps = planned_steps(config, num_frames)
     by_steps = math.inf if steps is None else PIXEL_TIME * steps * config.views.batch_size / num_frames

@@ -96,9 +96,9 @@ def add(
     motion: Motion | None,
     instead_of: Sequence[int] = (),
 ) -> None:
-    """Add `num` Gaussians, at frames and pixels drawn by squared error, in place of those of some indices.
+    """Add `num` Gaussians whose frames and pixels are drawn by squared error. Their moments start at zero.
 
-    Their moments start at zero.
+    `instead_of`: indices of Gaussians that are removed.
     """
     new = make_newborns(num, state, frames, config, motion)
     state.keep(np.delete(np.arange(state.num_gaussians), instead_of))
