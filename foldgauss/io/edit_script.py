@@ -6,8 +6,8 @@ values are in the units of `Edit`:
 - `[selections.NAME]`: `indices` (numbers and ranges of Gaussians, "3,17,40-52", with `num_gaussians`, which is
   checked, and, of a video in segments, the number of a `segment`), `mask` (an image, folder or video, with `label`,
   `level`), or
-  `box`, `polygon`, `color`, `click`, `moving`, `times`, with `frame`, `frames`, `tolerance`, `alive`, `threshold`,
-  `follow`, as `foldgauss.video.select` takes them; or `any`, `all`, `without`: lists of earlier names, for the union,
+  `layer` (a number or a name), `box`, `polygon`, `color`, `click`, `moving`, `times`, with `frame`, `frames`,
+  `tolerance`, `alive`, `threshold`, `follow`, as `foldgauss.video.select` takes them; or `any`, `all`, `without`: lists of earlier names, for the union,
   the intersection and the difference. All are evaluated on the video before the first edit.
 - `[[edits]]`, applied in order: `do` is one of `ACTIONS`, `select` a name (default: the current selection, at first
   everything), with the action's own keys; `frame`, `frames` or `times`, with `ease` and `curve`, for the span.
@@ -117,6 +117,7 @@ _KINDS = {
     "edits": _Kind("tables, each begun by [[edits]]", lambda value: isinstance(value, list) and _are_tables(value)),
     "layers": _Kind("tables, each begun by [[layers]]", lambda value: isinstance(value, list) and _are_tables(value)),
     "camera": _Kind("a table begun by [camera]", lambda value: isinstance(value, dict)),
+    "layer": _Kind("the number or the name of a layer", lambda value: _is_whole(value) or _TEXT.holds(value)),
     "moving": _Kind("true", lambda value: value is True),
     "where": _Kind("'front' or 'behind'", lambda value: value in ("front", "behind")),
     "frames": _FRAMES,
@@ -128,7 +129,7 @@ _KINDS = {
 }
 _COMBINATION = ("any", "all", "without")
 _MASK_FILE = ("label", "level")
-_CRITERIA = tuple(inspect.signature(select).parameters)[1:]
+_CRITERIA = ("layer", *tuple(inspect.signature(select).parameters)[1:])
 
 
 @dataclasses.dataclass(frozen=True)

@@ -2,6 +2,7 @@
 
 import dataclasses
 import hashlib
+import itertools
 import json
 import os
 from collections.abc import Sequence
@@ -23,6 +24,8 @@ CLIP_SUFFIXES = (
     *(".mpg", ".mpeg", ".m2v", ".vob", ".ts", ".mts", ".m2ts", ".3gp", ".3g2", ".mxf", ".y4m", ".mjpeg", ".ivf"),
     *(".nut", *ANIMATION_SUFFIXES),
 )
+#: In place of masks: the object that moves.
+MOVING = "moving"
 #: Folder, beside the models, of checkpoints and records.
 RECORDS = "records"
 #: Fields of a record besides the request and the scores of each frame.
@@ -53,7 +56,8 @@ class FitJob:
     `clip` and `target` are paths that every worker can open; `size` is the (height, width) of the frames, or None;
     `frames` the range (first, stop) of the clip, or None. With `index`, the file of a `FrameIndex`, frames are found by
     seeking, and counted from the first one of the index. `fps` replaces the clip's frame rate. `source` identifies the
-    clip: results of another source are not reused. `metadata` is added to the metadata of the model file. Checkpoint
+    clip: results of another source are not reused. `masks` is the path of the masks of objects that get layers of their
+    own, or `MOVING` for the object that moves. `metadata` is added to the metadata of the model file. Checkpoint
     and record are in `folder`, by default beside the model.
     """
 
@@ -69,17 +73,34 @@ class FitJob:
     folder: str | None = None
     source: dict[str, Any] = dataclasses.field(default_factory=dict)
     metadata: dict[str, Any] = dataclasses.field(default_factory=dict)
+    masks: str | None = None
 
     @property
     def request(self) -> dict[str, Any]:
         """What the results depend on, as JSON represents it: results of an equal request are reused."""
-        asked = {"config": dataclasses.asdict(self.config), "size": self.size, "frames": self.frames}
+        asked = {
+            "config": dataclasses.asdict(self.config),
+            "size": self.size,
+            "frames": self.frames,
+            "masks": self.masks,
+        }
         return json.loads(json.dumps(asked | {"source": self.source}))
 
     @property
     def checkpoint(self) -> Path:
-        """The file of the running fit."""
-        return self._beside(".checkpoint")
+        """The file of the running fit, of its first layer."""
+        return self.checkpoint_of(0)
+
+    def checkpoint_of(self, layer: int) -> Path:
+        """The file of the running fit of a layer."""
+        return self._beside(f".{layer}.checkpoint" if layer else ".checkpoint")
+
+    def remove_checkpoints(self) -> None:
+        """Remove the files of the fit."""
+        for layer in itertools.count():
+            if not self.checkpoint_of(layer).exists():
+                return
+            self.checkpoint_of(layer).unlink()
 
     @property
     def record(self) -> Path:

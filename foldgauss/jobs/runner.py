@@ -21,12 +21,15 @@ from foldgauss import __version__
 from foldgauss._runtime.checks import require
 from foldgauss.io import Clip, FrameIndex, read_indexed, read_video, save_video_model
 from foldgauss.io._atomic import OutputError, atomic_path, lock_output, write_or_keep
+from foldgauss.io.media.masks import read_object_masks
 from foldgauss.io.models.checkpoint import is_known_good, load_checkpoint, save_checkpoint
 from foldgauss.io.models.compact import COMPACT_SUFFIX, leave_room, save_compact
 from foldgauss.io.provenance import describe_reading, describe_source, fingerprint
-from foldgauss.jobs.job import FitJob, file_digest, limit_range, read_record
+from foldgauss.jobs.job import MOVING, FitJob, file_digest, limit_range, read_record
 from foldgauss.video import Evaluation, FitConfig, FitDiverged, FitState, VideoModel, evaluate
 from foldgauss.video.fitting.loop import FitInfo, finish, fit_steps
+from foldgauss.video.layered import LayerPlan, plan_layers, stack
+from foldgauss.video.motion.moving_object import find_moving_object
 
 #: Seconds between two checkpoints of a running fit.
 CHECKPOINT_SECONDS = 30.0
@@ -41,8 +44,8 @@ MAX_SHAPES = 8
 
 #: Sees every step of a fit; returns True to stop it.
 Observer = Callable[[FitState, FitInfo], bool | None]
-#: Opens the observer of a fit of these frames, from the state it resumes from, or None.
-OpenObserver = Callable[[Clip, FitState | None], AbstractContextManager[Observer]]
+#: Opens the observer of a fit of these frames, with these settings, from the state it resumes from, or None.
+OpenObserver = Callable[[Clip, FitConfig, FitState | None], AbstractContextManager[Observer]]
 #: Called with the error of a checkpoint that could not be written, and its step.
 CheckpointError = Callable[[OSError, int], None]
 
@@ -106,20 +109,29 @@ def run_fit(
         clip = read_indexed(FrameIndex.load(job.index), *job.frames, size=job.size)
         clip = dataclasses.replace(clip, fps=job.fps or clip.fps)
     _limit_compiled(clip.frames.shape)
-    checkpoint = Checkpoint(job.checkpoint, job.config, fingerprint(clip), on_checkpoint_error)
-    state = checkpoint.load() if resume else None
     span = {"frames": limit_range(job.frames, clip.num_declared)}
     about = describe_source(clip, job.config.seed) | span | describe_reading(clip) | job.metadata
-    config = dataclasses.replace(job.config, size_mb=leave_room(job.config.size_mb, about))
-    steps = fit_steps(clip.frames, config, state)
-    with observer(clip, state) as observe:
-        if not resume:  # an earlier fit could be resumed by mistake; its checkpoint goes once a step is taken
-            steps = itertools.chain([next(steps)], steps)
-            job.checkpoint.unlink(missing_ok=True)
-        state, info = run_steps(steps, observe, checkpoint, job.checkpoint_seconds)
-    model, quantized = finish(state, clip.frames, config, clip.fps)
+    models, compact, seconds, num_steps = {}, {}, 0.0, 0
+    for number, plan in enumerate(_plan_layers(job, clip)):
+        hidden = f"{plan.unknown:.0%} of what is behind objects is shown by no frame: texture from around it is fitted."
+        notes = clip.notes * (not number) + (hidden,) * (plan.unknown > 0)
+        part = dataclasses.replace(clip, frames=plan.frames, source=plan.name or clip.source, notes=notes)
+        checkpoint = Checkpoint(job.checkpoint_of(number), plan.config, fingerprint(part), on_checkpoint_error)
+        state = checkpoint.load() if resume else None
+        config = dataclasses.replace(plan.config, size_mb=leave_room(plan.config.size_mb, about))
+        steps = fit_steps(plan.frames, config, state, cuts=plan.cuts)
+        with observer(part, plan.config, state) as observe:
+            if not (resume or number):  # an earlier fit could be resumed by mistake; it goes once a step is taken
+                steps = itertools.chain([next(steps)], steps)
+                job.remove_checkpoints()
+            state, info = run_steps(steps, observe, checkpoint, job.checkpoint_seconds)
+        models[plan.name], compact[plan.name] = finish(state, plan.frames, config, clip.fps)
+        seconds, num_steps = seconds + state.seconds, num_steps + state.step
+    model, quantized = models.get(""), compact.get("")
+    if model is None:
+        model, quantized = stack(models), compact
     scores = measure(model, clip.frames)
-    about |= describe_fit(job.config, state) | mean_scores(scores)
+    about |= describe_fit(job.config, num_steps, seconds) | mean_scores(scores)
 
     def save(path: Path) -> Path:
         if path.suffix.lower() == COMPACT_SUFFIX:
@@ -136,8 +148,8 @@ def run_fit(
         "psnr": list(scores.psnr),
         "ssim": list(scores.ssim),
         **mean_scores(scores),
-        "steps": info.step,
-        "seconds": round(info.seconds, 2),
+        "steps": num_steps,
+        "seconds": round(seconds, 2),
         "stopped_by": info.stopped_by,
         "file_bytes": os.path.getsize(job.target),
         "file_digest": file_digest(job.target),
@@ -145,6 +157,25 @@ def run_fit(
         "notes": list(clip.notes),
         "warnings": missed_psnr(job.config, scores.mean_psnr),
     }
+
+
+def _plan_layers(job: FitJob, clip: Clip) -> list[LayerPlan]:
+    """The layers of the clip, or the clip as the only one."""
+    if job.masks is None:
+        return [LayerPlan("", clip.frames, job.config)]
+    require(
+        not clip.has_alpha,
+        "masks",
+        expected="a clip without alpha",
+        got=repr(clip.source),
+        cure="Its alpha cuts out the object.",
+    )
+    if job.masks == MOVING:
+        masks = {"object": find_moving_object(clip.frames)}
+    else:
+        begin = (job.metadata.get("frames") or job.frames or (0,))[0] or 0
+        masks = read_object_masks(job.masks, begin, clip.num_frames, clip.size)
+    return plan_layers(clip.frames, masks, job.config)
 
 
 def _write_model(job: FitJob, save: Callable[[Path], Path]) -> None:
@@ -188,16 +219,16 @@ def run_steps(
     return state, info
 
 
-def describe_fit(config: FitConfig, state: FitState) -> dict[str, Any]:
+def describe_fit(config: FitConfig, steps: int, seconds: float) -> dict[str, Any]:
     """Metadata of how a model was fitted: version, budgets and steps.
 
     A fit by `minutes` depends on the load of the machine: its metadata also hold the seconds of the clock.
     """
     budgets = {name: getattr(config, name) for name in ("steps", "minutes", "quality", "size_mb", "psnr")}
-    about = {"version": __version__, "steps": state.step}
+    about = {"version": __version__, "steps": steps}
     about["budget"] = {name: value for name, value in budgets.items() if value is not None}
     if config.minutes is not None:
-        about |= {"fit_seconds": round(state.seconds, 2)}
+        about |= {"fit_seconds": round(seconds, 2)}
     return about
 
 
@@ -266,12 +297,12 @@ def fit_job(job: FitJob, report: Report = lambda info: True) -> dict[str, Any]:
             return record
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always")
-            record = run_fit(job, lambda clip, state: nullcontext(_make_reporter(report)))
+            record = run_fit(job, lambda clip, config, state: nullcontext(_make_reporter(report)))
         texts = dict.fromkeys(" ".join(str(warning.message).split()) for warning in caught)
         record["warnings"] = [*texts, *record["warnings"]]
         with atomic_path(job.record) as temporary:
             temporary.write_text(json.dumps(record) + "\n")
-        job.checkpoint.unlink(missing_ok=True)
+        job.remove_checkpoints()
         return record
 
 

@@ -15,6 +15,7 @@ from foldgauss.video.fitting.density_control import DensityControl
 from foldgauss.video.fitting.divergence import DivergenceWarning, FitDiverged
 from foldgauss.video.fitting.loop import FitInfo, FitResult, FitState, fit, fit_steps, start_from
 from foldgauss.video.fitting.losses import register_loss
+from foldgauss.video.layered import fit_layers
 from foldgauss.video.models.density import density_image
 from foldgauss.video.models.frame_times import (
     FrameTimes,
@@ -30,6 +31,7 @@ from foldgauss.video.models.splats import FoldedSplats
 from foldgauss.video.models.video_model import VideoModel
 from foldgauss.video.motion.background_plate import fill_background
 from foldgauss.video.motion.camera_path import CameraPath, estimate_camera_path
+from foldgauss.video.motion.layer_clips import separate
 from foldgauss.video.motion.moving_object import NothingMoves, find_moving_object
 from foldgauss.video.motion.slow_motion import interpolate_frames
 from foldgauss.video.motion.stabilization import StabilizedVideo, stabilize
@@ -98,6 +100,7 @@ __all__ = [
     "fill_background",
     "find_moving_object",
     "fit",
+    "fit_layers",
     "fit_steps",
     "influence",
     "interpolate_frames",
@@ -110,6 +113,7 @@ __all__ = [
     "register_loss",
     "remapped_positions",
     "select",
+    "separate",
     "ssim",
     "stabilize",
     "start_from",

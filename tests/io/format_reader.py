@@ -48,6 +48,17 @@ def read(data, chunks=None):
     return header, arrays
 
 
+def split_layers(data):
+    """The bytes of each layer of a file by its name, from back to front; "" where there is one without a name."""
+    layers = {}
+    while data:
+        (length,) = struct.unpack_from("<I", data, 12)
+        header = json.loads(data[20 : 20 + length])
+        size = 20 + length + sum(sum(block["streams"]) for block in (header["motion"], *header["chunks"]))
+        layers[header.get("layer", "")], data = data[:size], data[size:]
+    return layers
+
+
 def _streams(data, at, block):
     """Streams of the block that begins here, None if it is damaged, and where it ends."""
     end = at + sum(block["streams"])

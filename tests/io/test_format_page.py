@@ -8,7 +8,7 @@ from pathlib import Path
 import equinox as eqx
 import numpy as np
 import pytest
-from format_reader import read
+from format_reader import read, split_layers
 from soft_models import crowd, of_degrees, on_paths, soft_model
 
 import foldgauss.io.page
@@ -171,3 +171,14 @@ def test_damaged_chunks_are_left_out(tmp_path):
     # Cut off within the last chunk, as of a file that has not arrived.
     _, arrays = read(bytes(data[:-5]))
     assert len(arrays["loc"]) == header["chunks"][0]["num_gaussians"]
+
+
+def test_layers_are_told_apart_by_the_page_alone(tmp_path):
+    front, back = (quantize_unevenly(model) for model in (make_model(), make_model(2)))
+    parts = split_layers(save_compact(tmp_path / "a.fgz", {"front": front, "back": back}).read_bytes())
+    assert list(parts) == ["back", "front"]
+    for layer, name in zip(load_video_model(tmp_path / "a.fgz").layers, ("front", "back"), strict=True):
+        assert layer.name == name
+        _, arrays = read(parts[name])
+        for leaf, values in leaves_of(layer.model).items():
+            np.testing.assert_array_equal(arrays[leaf], values, leaf)

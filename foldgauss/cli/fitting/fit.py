@@ -49,6 +49,7 @@ from foldgauss.io.models.compact import COMPACT_SUFFIX
 from foldgauss.io.models.video_model import MODEL_SUFFIX
 from foldgauss.jobs import FitJob
 from foldgauss.jobs import Stopped as FitStopped
+from foldgauss.jobs.job import MOVING
 from foldgauss.jobs.runner import run_fit
 from foldgauss.jobs.segments import SEGMENT_SECONDS, has_plan
 from foldgauss.video import Evaluation, FitDiverged, FitInfo
@@ -74,6 +75,14 @@ def fit(
     ] = None,
     size: Size = None,
     frames: Frames = None,
+    masks: Annotated[
+        str | None,
+        typer.Option(
+            metavar=f"PATH|{MOVING}",
+            help="Objects that get layers of their own: a folder with a label image for each frame, or a video; "
+            f"{MOVING}: the object that moves.",
+        ),
+    ] = None,
     overwrite: Overwrite = False,
     history: Annotated[
         Path | None,
@@ -105,6 +114,14 @@ def fit(
         parse_size(size),
         parse_frames(frames),
         checkpoint_seconds=checkpoint_seconds,
+        masks=masks if masks in (None, MOVING) else str(Path(masks).absolute()),
+    )
+    require(
+        history is None or masks is None,
+        "--history",
+        expected="a fit without layers",
+        got="--masks",
+        cure="Leave it out.",
     )
     display = choose_display(quiet, log_json)
     options = WorkerOptions(workers, scheduler, threads)
@@ -175,8 +192,8 @@ def fit_with_progress(
     """
 
     @contextmanager
-    def observe(clip: Clip, state: FitState | None) -> Iterator[Observer]:
-        _print_plan(clip, job.config, display)
+    def observe(clip: Clip, config: FitConfig, state: FitState | None) -> Iterator[Observer]:
+        _print_plan(clip, config, display)
         if state is not None:
             err.print(f"Continues {job.checkpoint} after {state.step:,} steps.", soft_wrap=True)
         recorded = None
@@ -209,7 +226,7 @@ def fit_with_progress(
         if job.checkpoint.exists():
             err.print(f"The fit is kept in {job.checkpoint}. {describe_continuation(overwrite)}", soft_wrap=True)
         raise
-    job.checkpoint.unlink(missing_ok=True)
+    job.remove_checkpoints()
     for text in record["warnings"]:
         warn(text)
     return record

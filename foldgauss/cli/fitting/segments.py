@@ -45,6 +45,7 @@ def fit_in_segments(
                 frames=job.frames,
                 segment_seconds=segment_seconds,
                 checkpoint_seconds=job.checkpoint_seconds,
+                masks=job.masks,
                 restart=overwrite,
             )
         _print_plan(fit, job.config, display, Path(job.clip), options)

@@ -4,6 +4,7 @@ import warnings
 from collections.abc import Sequence
 from pathlib import Path
 
+import cv2
 import numpy as np
 from jaxtyping import Bool, UInt8
 
@@ -90,6 +91,40 @@ def read_masks(
         return masks
     check_size(size)
     return np.ascontiguousarray(masks[..., *aspect_window(masks.shape[-2:], size)])
+
+
+def read_object_masks(
+    path: PathLike, first: int, num_frames: int, size: Size
+) -> dict[str, Bool[np.ndarray, "num_frames height width"]]:
+    """The masks of each object, by name, for `num_frames` frames of `size`, from frame `first` of the clip on.
+
+    A folder of label images, one for each frame of the clip or of the part: objects are called "object", or "object 1",
+    "object 2" by their labels; a video has one. Masks are cropped to the aspect of `size` around the center, then
+    resized. Raises as `read_masks`, and ValueError for another number of masks, and where no object is in them.
+    """
+    path = check_path(path)
+    check_input(path, "a folder or a video")
+    if path.is_dir():
+        labels = read_labels(choose_images(path, 0, None))
+        numbers = sorted(set(np.unique(labels).tolist()) - {0, VOID})
+        masks = {f"object {k}" if len(numbers) > 1 else "object": labels == k for k in numbers}
+    else:
+        masks = {"object": read_masks(path)}
+    found = {}
+    for name, own in masks.items():
+        own = own[first:] if len(own) >= first + num_frames else own
+        require(
+            own.ndim == 3 and len(own) >= num_frames,
+            "masks",
+            expected=f"one for each of {num_frames} frames",
+            got=f"{len(own)} in {str(path)!r}",
+        )
+        own = np.uint8(own[:num_frames, *aspect_window(own.shape[1:], size)])
+        own = np.stack([cv2.resize(mask, size[::-1], interpolation=cv2.INTER_NEAREST) > 0 for mask in own])
+        if own.any():
+            found[name] = own
+    require(found, "masks", expected="an object in them", got=f"none in {str(path)!r}")
+    return found
 
 
 def _select_label(paths: list[Path], label: int | None, source: Path) -> Bool[np.ndarray, "num_frames height width"]:

@@ -12,6 +12,7 @@ import math
 import os
 import warnings
 import zlib
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -55,6 +56,7 @@ from foldgauss.video.compression.streams import (
     last_cell,
     path_identities,
 )
+from foldgauss.video.editing.edited_video import EditedVideo, Layer
 from foldgauss.video.models.row_layout import MAX_DEGREE
 from foldgauss.video.models.shared_paths import MAX_PATHS
 from foldgauss.video.models.video_model import VideoModel
@@ -74,16 +76,21 @@ _ROUNDING = 1e-6  # by which the times of a model, float32, may differ from thos
 _SIDE = 1 << 20  # largest side of an image: a decoder holds it in memory
 
 
-def save_compact(path: PathLike, quantized: Quantized, *, metadata: dict | None = None) -> Path:
+def save_compact(
+    path: PathLike, quantized: Quantized | Mapping[str, Quantized], *, metadata: dict | None = None
+) -> Path:
     """Write a quantized model whole or not at all; equal ones give equal bytes. See `foldgauss.video.compress`.
+
+    Layers are given by name, from front to back. The file has them one after another, the last one first.
 
     Raises ValueError for a name that does not end in .fgz, `OutputError` where it cannot be written.
     """
     path = check_path(path, "path, quantized")
     check_compact_name(path)
-    data = pack_compact(quantized, metadata)
+    layers = quantized if isinstance(quantized, Mapping) else {"": quantized}
+    data = [pack_compact(one, metadata, name) for name, one in reversed(layers.items())]
     with atomic_path(path) as temporary:
-        temporary.write_bytes(data)
+        temporary.write_bytes(b"".join(data))
     return path
 
 
@@ -103,8 +110,8 @@ def check_compact_name(path: Path, parameter: str = "path") -> None:
     )
 
 
-def pack_compact(quantized: Quantized, metadata: dict | None = None) -> bytes:
-    """The bytes of the file."""
+def pack_compact(quantized: Quantized, metadata: dict | None = None, layer: str = "") -> bytes:
+    """The bytes of the file, or of a layer in it."""
     info, names = quantized.info, quantized.info.column_names
     header = dataclasses.asdict(info) | {"num_frames": len(quantized.intervals) + 1, "rules": []}
     for name in names:
@@ -121,7 +128,7 @@ def pack_compact(quantized: Quantized, metadata: dict | None = None) -> bytes:
         header["chunks"].append(own | _describe_streams(streams))
         parts.append(b"".join(streams))
         counts.append(chunk.num * len(names))
-    header["metadata"] = to_json_types(metadata or {})
+    header |= {"metadata": to_json_types(metadata or {})} | ({"layer": layer} if layer else {})
     text, blocks = to_json("header", header).encode(), [b"".join(motion), *parts]
     lacking = sum(_count_lacking(count, len(block)) for count, block in zip(counts, blocks, strict=True))
     text += b" " * (lacking - len(text))
@@ -182,26 +189,41 @@ def load_compact(path: PathLike, *, visible: tuple[float, float] = (0.0, 1.0)) -
         expected="the first and the last time, in [0, 1]",
         got=short_repr(visible),
     )
-    return _load(path, path.read_bytes(), visible, stacklevel=3)
+    return _load(path, path.read_bytes(), visible, stacklevel=3)[0]
 
 
-def load_compact_model(path: Path, data: bytes | None = None) -> VideoModel:
-    """The model in a compact file, or in `data`, the bytes of one that is a part of a file.
+def load_compact_model(path: Path, data: bytes | None = None) -> VideoModel | EditedVideo:
+    """The model in a compact file, or in `data`, the bytes of one that is a part of a file; or its layers.
 
     Raises as `load_compact`, also for values beyond float32. Warnings point at the caller of the function that calls
     this one, `load_video_model`.
     """
-    with np.errstate(over="ignore", invalid="ignore"):
-        model = dequantize(_load(path, path.read_bytes() if data is None else data, stacklevel=4))
-    finite = all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(model))
-    _check_file(finite, path, "one with values beyond float32")
-    return model
+    rest, layers = path.read_bytes() if data is None else data, []
+    while rest:
+        try:
+            quantized, name, rest = _load(path, rest, stacklevel=4)
+        except ModelFileError:
+            if not layers:
+                raise
+            warnings.warn(f"{str(path)!r}: a layer is cut off or damaged. Copy it again.", stacklevel=3)
+            break
+        with np.errstate(over="ignore", invalid="ignore"):
+            model = dequantize(quantized)
+        finite = all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(model))
+        _check_file(finite, path, "one with values beyond float32")
+        layers.insert(0, Layer(model, name=name))
+    return EditedVideo(tuple(layers)) if layers[-1].name else layers[-1].model
 
 
-def _load(path: Path, data: bytes, visible: tuple[float, float] = (0.0, 1.0), *, stacklevel: int) -> Quantized:
+def _load(
+    path: Path, data: bytes, visible: tuple[float, float] = (0.0, 1.0), *, stacklevel: int
+) -> tuple[Quantized, str, bytes]:
+    """The first layer in `data`, or the only one; its name; and the bytes after it."""
     header = _read_header(path, data)
     try:
-        quantized, note = _decode(path, header, data, visible)
+        quantized, note, size = _decode(path, header, data, visible)
+        name = header.get("layer", "")
+        _check(isinstance(name, str), "layer", short_repr(name))
     except HEADER_ERRORS as error:
         if isinstance(error, ModelFileError):
             raise
@@ -210,7 +232,7 @@ def _load(path: Path, data: bytes, visible: tuple[float, float] = (0.0, 1.0), *,
         ) from error
     if note:
         warnings.warn(note, stacklevel=stacklevel)
-    return quantized
+    return quantized, name, data[size:]
 
 
 def compact_metadata(path: Path) -> dict:
@@ -255,8 +277,8 @@ def _reject_constant(name: str) -> None:
     raise ValueError(f"{name} is not valid JSON")
 
 
-def _decode(path: Path, header: dict, data: bytes, visible: tuple[float, float]) -> tuple[Quantized, str]:
-    """The model without the chunks that are not visible or cannot be read; and a warning of the latter, or ""."""
+def _decode(path: Path, header: dict, data: bytes, visible: tuple[float, float]) -> tuple[Quantized, str, int]:
+    """The model without the chunks that are not visible or cannot be read; a warning of the latter, or ""; its size."""
     info, num_frames = _parse_info(header), header["num_frames"]
     _check(is_integer(num_frames, 1), "num_frames", num_frames)
     _check_blocks(header, info)
@@ -281,7 +303,7 @@ def _decode(path: Path, header: dict, data: bytes, visible: tuple[float, float])
     lost = _describe_missing(header["chunks"], missing)
     _check_file(chunks, path, f"one without a chunk that can be read ({lost})")
     note = f"{str(path)!r}: {lost}. Copy it again." if missing else ""
-    return Quantized(info, rules, tuple(chunks), intervals, **paths), note
+    return Quantized(info, rules, tuple(chunks), intervals, **paths), note, start + sum(after["streams"])
 
 
 def _describe_missing(chunks: list[dict], missing: list[dict]) -> str:

@@ -229,6 +229,7 @@ def _describe_layer(layer: Layer) -> dict:
         "model": _describe_video(layer.model),
         "overlays": list(map(describe_overlay, layer.overlays)),
         "clocks": list(map(describe_overlay, layer.clocks)),
+        "name": layer.name,
     }
 
 
@@ -256,7 +257,9 @@ def _layer_skeleton(header: dict) -> Layer:
     model = _video_skeleton(header["model"])
     mask = jax.ShapeDtypeStruct((model.splats.num_gaussians,), np.bool_)
     overlays, clocks = (tuple(restore_overlay(one, mask) for one in header[name]) for name in ("overlays", "clocks"))
-    return Layer(model, overlays, clocks)
+    name = header.get("name", "")
+    require(isinstance(name, str), "name", expected="a text", got=short_repr(name))
+    return Layer(model, overlays, clocks, name)
 
 
 def _camera_skeleton(header: dict | None) -> Camera | None:

@@ -128,8 +128,14 @@ class Edit:
     _time_map: TimeMap | None = dataclasses.field(repr=False)
 
     def video(self) -> VideoModel | EditedVideo:
-        """The edited video: a folded model if all edits could be baked, else an `EditedVideo`."""
+        """The edited video: a folded model if all edits could be baked, else an `EditedVideo`.
+
+        Layers of which `vanish` left nothing are left out, but for the one that determines the frame times.
+        """
         video = self._video
+        lead = video.layers[video.timeline]
+        layers = tuple(layer for layer in video.layers if layer is lead or not layer.is_gone)
+        video = dataclasses.replace(video, layers=layers, timeline=layers.index(lead) - len(layers))
         plain = len(video.layers) == 1 and video.camera is None
         layer = video.layers[0]
         return layer.model if plain and not layer.overlays and not layer.clocks else video
@@ -144,7 +150,7 @@ class Edit:
         self,
         selection: "Selection | Mask | Callable[[VideoModel | EditedVideo], Selection] | None" = None,
         *,
-        layer: int | None = None,
+        layer: int | str | None = None,
         **criteria: object,
     ) -> "Edit":
         """Choose the Gaussians that the next edits apply to, from all Gaussians; without arguments, all of them.
@@ -152,8 +158,9 @@ class Edit:
         `selection`: a `Selection` or a mask bool (num_gaussians,) over the Gaussians at the start of the chain, which
         are selected wherever they are now, together with their copies; or a function of `video()` that returns one over
         the current Gaussians. Else `criteria` as `foldgauss.video.select` takes them (`mask=`, `box=`, `color=`, ...),
-        evaluated on each layer's model, or on layer number `layer` only; on the model without overlays, so with baked
-        edits only. Masks are over the Gaussians of all layers, front layer first, or of `layer`.
+        evaluated on each layer's model, or on the layers with the number or name `layer` only; on the model without
+        overlays, so with baked edits only. Masks are over the Gaussians of all layers, front layer first, or of
+        `layer`.
         """
         check_select_arguments(selection, criteria)
         layers, numbers = self._video.layers, self._layer_numbers(layer)
@@ -166,16 +173,18 @@ class Edit:
             masks[k] = mask
         return dataclasses.replace(self, selection=Selection(np.concatenate(masks)))
 
-    def _layer_numbers(self, layer: int | None) -> Sequence[int]:
-        """The number of one layer, or those of all."""
-        num = len(self._video.layers)
+    def _layer_numbers(self, layer: int | str | None) -> Sequence[int]:
+        """The numbers of the layers with a number or a name, or of all."""
+        names = [one.name for one in self._video.layers]
+        chosen = layer if is_integer(layer, 0) else None
+        numbers = [k for k, name in enumerate(names) if layer is None or k == chosen or (name and name == layer)]
         require(
-            layer is None or (is_integer(layer, 0) and layer < num),
+            numbers,
             "layer",
-            expected=f"a whole number in [0, {num - 1}]",
-            got=layer,
+            expected=" or ".join([f"a whole number in [0, {len(names) - 1}]", *map(repr, filter(None, names))]),
+            got=repr(layer),
         )
-        return range(num) if layer is None else [layer]
+        return numbers
 
     def _resolve(self, selection: object, numbers: Sequence[int]) -> list[Mask]:
         """A mask over the current Gaussians for each of the layers `numbers`."""

@@ -44,6 +44,7 @@ class Layer(eqx.Module):
     model: VideoModel
     overlays: tuple[AbstractOverlay, ...] = ()
     clocks: tuple[Retiming, ...] = ()
+    name: str = eqx.field(static=True, default="")  #: of the object, for `Edit.select`
 
     def __check_init__(self) -> None:
         num = getattr(self.model.splats.loc, "shape", (None,))[0]
@@ -59,6 +60,12 @@ class Layer(eqx.Module):
     @property
     def num_gaussians(self) -> int:
         return self.model.splats.num_gaussians
+
+    @property
+    def is_gone(self) -> bool:
+        """Whether all of it is always hidden."""
+        hides = (one for one in self.overlays if isinstance(one, Opacity) and one.span is None and one.factor == 0)
+        return any(np.asarray(one.mask).all() for one in hides)
 
     @property
     def holds_frames(self) -> bool:
@@ -110,7 +117,8 @@ def gather_layer(
         overlays += [dataclasses.replace(overlay, mask=one) for one in masks if one.any()]
     clocks = [dataclasses.replace(clock, mask=np.asarray(clock.mask)[source]) for clock in layer.clocks]
     model = dataclasses.replace(layer.model, splats=layer.model.splats.take(source))
-    return Layer(model, tuple(overlays), tuple(clock for clock in clocks if clock.mask.any()))
+    clocks = tuple(clock for clock in clocks if clock.mask.any())
+    return dataclasses.replace(layer, model=model, overlays=tuple(overlays), clocks=clocks)
 
 
 def can_delete(layer: Layer, mask: Mask) -> bool:

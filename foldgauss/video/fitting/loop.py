@@ -7,7 +7,7 @@ import dataclasses
 import functools
 import math
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import NamedTuple
 
 import jax
@@ -129,6 +129,7 @@ def fit_steps(
     *,
     controls: Iterable[DensityControl] = (),
     motion: Motion | None = None,
+    cuts: Sequence[int] | None = None,
     clock: Callable[[], float] = time.perf_counter,
 ) -> Iterator[tuple[FitState, FitInfo]]:
     """The steps of a fit to `frames`, as of `fit`, from the start or resumed from `state`: yields (state, info).
@@ -136,8 +137,8 @@ def fit_steps(
     The state is updated in place: take `state.copy()` of one to keep. `controls`, raises and warns as `fit`.
 
     `motion`: the optical flow of the frames, where it is already known; computing it takes some hundredths of a second
-    per frame. `clock` gives seconds, of which `FitConfig.minutes` is a budget: with `time.process_time` and one thread,
-    fits beside other work are comparable.
+    per frame. `cuts`: the frames with which shots begin, if they are not to be found. `clock` gives seconds, of which
+    `FitConfig.minutes` is a budget: with `time.process_time` and one thread, fits beside other work are comparable.
     """
     check_frames(frames)
     has_alpha, interpolated = frames.shape[3] == 4, config.views.interpolation_fraction
@@ -158,7 +159,7 @@ def fit_steps(
     engine = choose_engine(frames, config)
     _warm_up(frames, config, engine)
     find_motion = motion_finder(frames, motion)
-    state = start(frames, config, find_motion, clock) if state is None else state
+    state = start(frames, config, find_motion, clock, cuts) if state is None else state
     require(
         len(state.frame_errors) == len(frames),
         "frames",
@@ -271,13 +272,15 @@ def start(
     config: FitConfig,
     find_motion: Callable[[], Motion] | None = None,
     clock: Callable[[], float] = time.perf_counter,
+    cuts: Sequence[int] | None = None,
 ) -> FitState:
     """State before the first step; frame times start evenly in each shot."""
     find_motion = find_motion or motion_finder(frames)
     has_alpha, frames = frames.shape[3] == 4, np.ascontiguousarray(frames[..., :3])  # as seen over black
     begun, num_frames = clock(), len(frames)
     motion = find_motion() if config.follows_motion else None
-    logits = np.array(make_time_logits(num_frames, motion.cuts if motion is not None else []), np.float32)
+    cuts = cuts if cuts is not None else motion.cuts if motion is not None else []
+    logits = np.array(make_time_logits(num_frames, cuts), np.float32)
     choose_num = functools.partial(chosen_num_gaussians, config, *frames.shape[:3])
     shape = {"degree": config.fold_degree, "seed": config.seed, "envelope": envelope_of(config)}
     if config.initialization == "uniform":

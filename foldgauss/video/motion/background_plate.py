@@ -40,6 +40,10 @@ UNCOVERED = 250 / 255
 #: Where no frame shows more than this fraction of the removed area, half of that is farther than `MARGIN` from what is
 #: known: wider than the rims that interpolation closes unseen.
 MUCH_UNKNOWN = 0.1
+#: Texture is made anew where more than this fraction of what is unknown in a frame was in no other frame.
+NEW_TEXTURE = 0.1
+#: It is found in images whose longer side is at most so many pixels: the time rises with the fourth power.
+TEXTURE_SIDE = 240
 #: What an object covers is replaced with this margin, a fraction of the longer side,
 MARGIN = 0.012
 #: and a soft edge of this width, a fraction of it too.
@@ -113,50 +117,113 @@ def check_frames(frames: np.ndarray) -> None:
     )
 
 
+def check_masks(frames: Frames, masks: np.ndarray) -> None:
+    """Raise ValueError unless there is one mask for each frame, of its size."""
+    shape, dtype = np.shape(masks), np.asarray(masks).dtype
+    require(
+        shape == frames.shape[:3] and dtype.kind == "b",
+        "masks",
+        expected=f"bool {frames.shape[:3]}",
+        got=f"{dtype} {shape}",
+    )
+
+
 def fill_background(frames: Frames, masks: Masks, *, alignment: Alignment | None = None) -> Frames:
     """The frames without what the masks cover: other frames, moved as the background, show what is behind it.
 
-    A pixel is the median of the frames that show it, up to `PLATE_REACH` frames away within its shot. One that no
-    frame shows is interpolated from its surroundings, with a warning if their fraction is above `MUCH_UNKNOWN`. Pixels
-    away from the masks stay as they are. `alignment` aligns the frames. By default it is estimated.
+    See `complete_background`. Pixels away from the masks stay as they are. `alignment` aligns the frames. By default it
+    is estimated. Warns where more than `MUCH_UNKNOWN` of the pixels are shown by no frame.
 
     Raises ValueError for frames of another type, and masks of another size.
     Example: `fill_background(frames, find_moving_object(frames, shadow=True))`.
     """
     check_frames(frames)
-    masks = np.asarray(masks)
-    require(
-        masks.shape == frames.shape[:3] and masks.dtype == bool,
-        "masks",
-        expected=f"bool {frames.shape[:3]}",
-        got=f"{masks.dtype} {masks.shape}",
-    )
+    check_masks(frames, masks)
+    covered = cover(masks)
+    plates, unknown = complete_background(frames, covered, alignment)
+    edge = max(SOFT_EDGE * max(frames.shape[1:3]), 0.5)
+    for k in np.flatnonzero(covered.any((1, 2))):
+        # From 0 at the border of what is replaced, where the blurred mask is a half, to 1.
+        weight = np.clip(2 * cv2.GaussianBlur(covered[k].astype(np.float32), (0, 0), edge) - 1, 0, 1)[..., None]
+        plates[k] = (weight * plates[k] + (1 - weight) * frames[k]).round()
+    if unknown > MUCH_UNKNOWN:
+        text = f"{unknown:.0%} of the removed area is shown by no frame and filled with texture from its surroundings."
+        warnings.warn(f"{text} Take more frames, in which the object moves away from it.", stacklevel=2)
+    return plates
+
+
+def cover(masks: Masks) -> Masks:
+    """The masks grown by `MARGIN`: what is outside them is taken to be background."""
+    diameter = 2 * round(MARGIN * max(masks.shape[1:])) + 1
+    return np.stack([dilate(mask, diameter) for mask in masks])
+
+
+def complete_background(frames: Frames, covered: Masks, alignment: Alignment | None = None) -> tuple[Frames, float]:
+    """The frames with the background in place of what is `covered`, and the fraction of it that no frame shows.
+
+    A pixel is the median of the frames that show it, up to `PLATE_REACH` frames away within its shot. One that no frame
+    shows is filled with texture in one frame of its shot and moved with the background to the others, so that it keeps
+    still.
+
+    Source: He and Sun 2012, statistics of patch offsets (OpenCV's `xphoto`); Telea 2004 for small rests.
+    """
     alignment = Alignment.from_frames(frames) if alignment is None else alignment
-    side = max(frames.shape[1:3])
-    margin, edge = 2 * round(MARGIN * side) + 1, max(SOFT_EDGE * side, 0.5)
-    covered = np.stack([dilate(mask, margin) for mask in masks])
-    filled, num_unknown = frames.copy(), np.zeros(len(frames), int)
+    plates, unknown = frames.copy(), np.zeros_like(covered)
 
     def fill(item: tuple[int, tuple[int, int]]) -> None:
         k, shot = item
-        if not covered[k].any():
-            return
-        x, y, width, height = cv2.boundingRect(covered[k].astype(np.uint8))
-        window = slice(y, y + height), slice(x, x + width)
-        plate, count = render_plate(frames, covered, alignment, k, shot, box=window)
-        unknown = np.uint8(count == 0)
-        num_unknown[k] = (unknown & covered[k][window]).sum()
-        plate = cv2.inpaint(plate, unknown, 3, cv2.INPAINT_TELEA) if unknown.any() else plate
-        # From 0 at the border of what is replaced, where the blurred mask is a half, to 1.
-        weight = np.clip(2 * cv2.GaussianBlur(covered[k][window].astype(np.float32), (0, 0), edge) - 1, 0, 1)[..., None]
-        filled[k][window] = (weight * plate + (1 - weight) * frames[k][window]).round()
+        if covered[k].any():
+            x, y, width, height = cv2.boundingRect(covered[k].astype(np.uint8))
+            window = slice(y, y + height), slice(x, x + width)
+            plate, count = render_plate(frames, covered, alignment, k, shot, box=window)
+            inside = covered[k][window]
+            plates[k][window][inside] = plate[inside]
+            unknown[k][window] = inside & (count == 0)
 
     run_tasks(fill, [(k, shot) for shot in alignment.shots for k in range(*shot)])
-    unknown, removed = num_unknown.sum(), covered.sum()
-    if unknown > MUCH_UNKNOWN * removed:
-        text = f"{unknown / removed:.0%} of the removed area is shown by no frame and filled from its surroundings."
-        warnings.warn(f"{text} It is a smear: take more frames, in which the object moves away from it.", stacklevel=2)
-    return filled
+    fraction = float(unknown.sum() / max(covered.sum(), 1))
+    for first, stop in alignment.shots:
+        _fill_unknown(plates, unknown, alignment, range(first, stop))
+    return plates, fraction
+
+
+def _fill_unknown(plates: Frames, unknown: Masks, alignment: Alignment, shot: range) -> None:
+    """Fill what no frame of a shot shows, from its middle on, in place."""
+    size = plates.shape[2], plates.shape[1]
+    to_image = _scale_pixels(plates.shape[1:3], alignment.images.shape[1:])
+    filled: list[int] = []
+    for k in sorted(shot, key=lambda k: abs(k - shot[len(shot) // 2])):
+        rest = unknown[k].copy()
+        for other in filled:
+            if not rest.any():
+                break
+            to_other = np.linalg.inv(to_image) @ alignment.between(k, other) @ to_image
+            known = rest & (warp_by(np.uint8(unknown[other]), to_other, size, cv2.BORDER_CONSTANT) > 0)
+            plates[k][known] = warp_by(plates[other], to_other, size)[known]
+            rest &= ~known
+        if not rest.any():
+            continue
+        if rest.sum() > NEW_TEXTURE * unknown[k].sum():
+            filled.append(k)
+            fill_with_texture(plates[k], rest)
+        else:
+            plates[k] = cv2.inpaint(plates[k], np.uint8(rest), 3, cv2.INPAINT_TELEA)
+
+
+def fill_with_texture(image: UInt8[np.ndarray, "height width 3"], unknown: Bool[np.ndarray, "height width"]) -> None:
+    """Fill what is unknown in the image with texture from its surroundings, in place."""
+    x, y, width, height = cv2.boundingRect(np.uint8(unknown))
+    around = max(width, height) // 2 + 8
+    window = slice(max(y - around, 0), y + height + around), slice(max(x - around, 0), x + width + around)
+    whole, scale = image[window].shape[1::-1], min(1.0, TEXTURE_SIDE / (max(width, height) + 2 * around))
+    size = max(round(scale * whole[0]), 1), max(round(scale * whole[1]), 1)
+    lab = cv2.cvtColor(cv2.resize(image[window], size, interpolation=cv2.INTER_AREA), cv2.COLOR_RGB2LAB)
+    missing = cv2.resize(np.float32(unknown[window]), size, interpolation=cv2.INTER_AREA) > 0
+    found = np.zeros_like(lab)
+    cv2.setRNGSeed(0)
+    cv2.xphoto.inpaint(lab, np.uint8(255 * ~missing), found, cv2.xphoto.INPAINT_SHIFTMAP)
+    found = cv2.resize(cv2.cvtColor(found, cv2.COLOR_LAB2RGB), whole, interpolation=cv2.INTER_CUBIC)
+    image[unknown] = found[unknown[window]]
 
 
 def render_plate(

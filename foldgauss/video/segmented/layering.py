@@ -117,7 +117,8 @@ def _convert_layer(layer: Layer, time_map: TimeMap) -> Layer:
     overlays = (_convert_overlay(overlay, time_map) for overlay in layer.overlays)
     # The last clock is applied first.
     retiming = Retiming(np.ones(layer.num_gaussians, bool), None, time_map.to_whole)
-    return Layer(layer.model, tuple(one for one in overlays if one is not None), (*layer.clocks, retiming))
+    overlays = tuple(one for one in overlays if one is not None)
+    return dataclasses.replace(layer, overlays=overlays, clocks=(*layer.clocks, retiming))
 
 
 def _drop_unseen(layer: Layer, time_map: TimeMap) -> Layer:

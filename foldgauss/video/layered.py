@@ -1,0 +1,87 @@
+"""Fits in layers: each object of a clip, and the background behind them, has Gaussians of its own."""
+
+import math
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool
+
+from foldgauss.video.editing.edited_video import EditedVideo, Layer
+from foldgauss.video.fitting.config import FitConfig
+from foldgauss.video.fitting.loop import FitInfo, FitResult, finish, fit_steps
+from foldgauss.video.fitting.state import FitState
+from foldgauss.video.models.video_model import VideoModel
+from foldgauss.video.motion.background_plate import Frames
+from foldgauss.video.motion.layer_clips import separate
+from foldgauss.video.motion.optical_flow import motion_finder
+
+#: An object changes more from frame to frame than the background, whose motion is the camera's: so many times as many
+#: bytes for each of its pixels.
+OBJECT_SHARE = 3.0
+
+
+class LayerPlan(NamedTuple):
+    """What is fitted as one layer."""
+
+    name: str
+    frames: np.ndarray  #: uint8 (num_frames, height, width, 4) of an object, (..., 3) of the background
+    config: FitConfig
+    cuts: Sequence[int] | None = None  #: of the clip: all layers have the same frame times; None: to be found
+    unknown: float = 0.0  #: fraction of what is behind objects that no frame shows, of the background
+
+
+def plan_layers(
+    frames: Frames, masks: Mapping[str, Bool[np.ndarray, "frames height width"]], config: FitConfig
+) -> list[LayerPlan]:
+    """The layers of a clip, from front to back: see `separate`.
+
+    Frame times are not learned, so that they are the same in all layers. `minutes` and `size_mb` are divided by the
+    areas of the layers, where a pixel of an object counts `OBJECT_SHARE`. A PSNR is that of the visible pixels: errors
+    are then the same in all layers, as with one λ.
+    """
+    parts, unknown = separate(frames, masks)
+    cuts = motion_finder(frames)().cuts
+    areas = [OBJECT_SHARE * mask.mean() for mask in masks.values()]
+    shares = np.array([*areas, 1.0]) / (sum(areas) + 1)
+    plans = []
+    for (name, own), share in zip(parts.items(), shares, strict=True):
+        changes: dict[str, float] = {"rates.frame_times": 0.0}
+        changes |= {key: share * getattr(config, key) for key in ("minutes", "size_mb") if getattr(config, key)}
+        if own.shape[3] == 4:
+            changes["views.interpolation_fraction"] = 0.0
+            if config.psnr is not None:
+                changes["psnr"] = config.psnr - 10 * math.log10((own[..., 3] > 0).mean())
+        plans.append(LayerPlan(name, own, config.replace(**changes), cuts, unknown * (own.shape[3] == 3)))
+    return plans
+
+
+def stack(models: Mapping[str, VideoModel]) -> EditedVideo:
+    """The video of named layers, from front to back."""
+    return EditedVideo(tuple(Layer(model, name=name) for name, model in models.items()))
+
+
+def fit_layers(
+    frames: Frames,
+    masks: Mapping[str, Bool[np.ndarray, "frames height width"]],
+    config: FitConfig | None = None,
+    *,
+    fps: float = 25.0,
+    observers: Iterable[Callable[[FitState, FitInfo], None]] = (),
+) -> tuple[EditedVideo, dict[str, FitResult]]:
+    """Fit each object of `masks`, and the background without them, with Gaussians of its own.
+
+    The layers composited are the clip. An object keeps its outline wherever it is moved, and the background is whole
+    behind it. Returns the video, whose layers have the names of the masks and "background", and the result of each
+    layer. Other arguments as of `fit`. Raises as `fit` and `separate`.
+
+    Example: `fit_layers(clip.frames, {"ball": masks}, FitConfig(steps=1000))[0].render(0.5)`. Source: VeGaS, section 4.
+    """
+    observers, results = list(observers), {}
+    for plan in plan_layers(frames, masks, FitConfig() if config is None else config):
+        for state, info in fit_steps(plan.frames, plan.config, cuts=plan.cuts):
+            for observe in observers:
+                observe(state, info)
+        model, quantized = finish(state, plan.frames, plan.config, fps)
+        results[plan.name] = FitResult(model, [info], quantized)
+    return stack({name: result.model for name, result in results.items()}), results

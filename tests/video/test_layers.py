@@ -1,0 +1,297 @@
+"""Fits in layers: clips taken apart, models of each object and of the whole background, and their files."""
+
+import cv2
+import numpy as np
+import pytest
+from commands import call
+from panned_clips import SIZE, disc_clip, panned, texture
+
+from foldgauss.io import load_video_model, read_video, save_compact, save_video_model, write_frames
+from foldgauss.io.edit_script import EditScriptError, parse_edit_script
+from foldgauss.io.media.masks import read_object_masks
+from foldgauss.io.models.model_file import ModelFileError
+from foldgauss.jobs import runner
+from foldgauss.video import EditedVideo, FitConfig, edit, evaluate, psnr
+from foldgauss.video.layered import fit_layers, plan_layers
+from foldgauss.video.motion.background_plate import complete_background, cover, fill_with_texture
+from foldgauss.video.motion.layer_clips import separate
+
+CONFIG = FitConfig(quality=60.0, steps=300)
+
+
+@pytest.fixture(scope="module")
+def clip():
+    return disc_clip(num_frames=8)
+
+
+@pytest.fixture(scope="module")
+def fitted(clip):
+    frames, _, masks = clip
+    return fit_layers(frames, {"disc": masks}, CONFIG, fps=20.0)
+
+
+def composite(layers):
+    """The layers over one another, the last one behind."""
+    *objects, image = [one.astype(float) for one in layers.values()]
+    for one in reversed(objects):
+        image = one[..., :3] + (1 - one[..., 3:] / 255) * image
+    return image.round().astype(np.uint8)
+
+
+# ------------------------------------------------------------------------------------------- clips taken apart
+
+
+def test_layers_make_up_the_clip_and_are_those_it_was_made_of(clip):
+    frames, empty, masks = clip
+    layers, unknown = separate(frames, {"disc": masks})
+    assert list(layers) == ["disc", "background"]
+    assert unknown < 0.35
+    assert min(map(psnr, frames, composite(layers))) > 40
+    alpha = layers["disc"][..., 3]
+    assert (alpha[masks] == 255).all()
+    assert (alpha[~cover(masks)] == 0).all()
+    assert (layers["disc"][..., :3] <= layers["disc"][..., 3:]).all()
+    known = np.stack([cv2.erode(np.uint8(one), np.ones((3, 3))) for one in ~masks]) > 0
+    assert (layers["background"][known] == frames[known]).mean() > 0.95
+    assert np.mean(list(map(psnr, empty, layers["background"]))) > 26
+
+
+def test_soft_edges_are_found_where_the_colors_differ():
+    behind, front = np.full((4, 60, 80, 3), (30, 60, 200), np.uint8), np.array([220, 120, 20])
+    x = np.arange(80)
+    alpha = np.clip((40 - x) / 4 + 0.5, 0, 1)[:, None]
+    frames = (alpha * front + (1 - alpha) * behind).round().astype(np.uint8)
+    rows = np.arange(60)[:, None] < 30  # where there is no object, the background is seen
+    frames = np.where(rows[..., None], frames, behind)
+    masks = np.broadcast_to((alpha[:, 0] > 0.9) & rows, (4, 60, 80))
+    layers, _ = separate(frames, {"edge": masks})
+    found = layers["edge"][1, 10, :, 3] / 255
+    band = (found > 0.02) & (found < 0.98)
+    assert band.any()
+    assert np.abs(found - alpha[:, 0])[band].max() < 0.35
+
+
+def test_two_objects_that_touch_leave_no_gap():
+    rng = np.random.default_rng(0)
+    frames = np.stack([cv2.resize(rng.integers(0, 255, (6, 8, 3), np.uint8), (80, 60))] * 4)
+    one, other = (np.zeros((4, 60, 80), bool) for _ in range(2))
+    one[:, 10:40, 10:40], other[:, 10:40, 40:70] = True, True
+    layers, _ = separate(frames, {"one": one, "other": other})
+    assert list(layers) == ["one", "other", "background"]
+    assert np.abs(composite(layers).astype(int) - frames)[one | other].max() <= 1
+
+
+@pytest.mark.parametrize(
+    ("masks", "told"),
+    [
+        ({}, "masks: expected at least one"),
+        ({"background": np.ones((4, 8, 8), bool)}, "not called 'background'"),
+        ({"it": np.zeros((4, 8, 8), bool)}, "masks that are not empty, got an empty one"),
+        ({"it": np.ones((4, 8, 9), bool)}, r"expected bool \(4, 8, 8\), got bool \(4, 8, 9\)"),
+        ({"it": np.ones((4, 8, 8))}, "got float64"),
+    ],
+)
+def test_wrong_masks_are_refused(masks, told):
+    with pytest.raises(ValueError, match=told):
+        separate(np.zeros((4, 8, 8, 3), np.uint8), masks)
+
+
+def test_what_no_frame_shows_is_filled_once_and_moves_with_the_background():
+    ground = texture(3)
+    frames = np.stack([panned(ground, (20 + 2 * k, 15)) for k in range(8)]).clip(0, 255).round().astype(np.uint8)
+    covered = np.zeros(frames.shape[:3], bool)
+    for k in range(8):
+        covered[k, 30:55, 60 - 2 * k : 90 - 2 * k] = True  # always the same part of the ground
+    filled, unknown = complete_background(np.where(covered[..., None], 0, frames).astype(np.uint8), covered)
+    assert unknown > 0.9
+    patches = np.stack([one[33:52, 63 - 2 * k : 87 - 2 * k] for k, one in enumerate(filled)]).astype(float)
+    assert np.abs(patches - patches[4]).mean() < 6
+    assert patches.min(axis=(0, 3)).mean() > 40  # nothing black
+    assert patches.std(axis=(1, 2)).mean() > 0.4 * ground.std()
+    assert (filled[~covered] == frames[~covered]).all()
+
+
+def test_texture_replaces_only_what_is_unknown():
+    image = texture(1, (60, 90)).clip(0, 255).astype(np.uint8)
+    unknown = np.zeros((60, 90), bool)
+    unknown[20:40, 30:60] = True
+    holed = np.where(unknown[..., None], 0, image).astype(np.uint8)
+    fill_with_texture(holed, unknown)
+    assert (holed[~unknown] == image[~unknown]).all()
+    assert abs(float(holed[unknown].mean()) - image.mean()) < 25
+
+
+# ------------------------------------------------------------------------------------------------------ fits
+
+
+def test_budgets_are_divided(clip):
+    frames, _, masks = clip
+    plans = plan_layers(frames, {"disc": masks}, FitConfig(minutes=2.0, size_mb=0.5))
+    assert sum(plan.config.minutes for plan in plans) == pytest.approx(2)
+    assert sum(plan.config.size_mb for plan in plans) == pytest.approx(0.5)
+    assert all(not plan.config.learns_frame_times for plan in plans)
+    disc, ground = plan_layers(frames, {"disc": masks}, FitConfig(psnr=30.0))
+    assert ground.config.psnr == 30
+    assert disc.config.psnr == pytest.approx(30 - 10 * np.log10((disc.frames[..., 3] > 0).mean()))
+
+
+def test_layers_composited_are_the_clip(fitted, clip):
+    video, results = fitted
+    frames, empty, _ = clip
+    assert [layer.name for layer in video.layers] == list(results) == ["disc", "background"]
+    assert evaluate(video, frames).mean_psnr > 27
+    assert video.fps == 20
+    gone = edit(video).select(layer="disc").vanish().video()
+    assert evaluate(gone, empty).mean_psnr > 25
+    assert gone.num_gaussians == results["background"].model.num_gaussians
+    assert (edit(video).select(layer="background").vanish().video().render(0.5)[:8] == 0).all()
+
+
+def test_layers_are_edited_by_name(fitted):
+    video, results = fitted
+    num = results["disc"].model.num_gaussians
+    assert edit(video).select(layer="disc").selection == edit(video).select(layer=0).selection
+    copied = edit(video).select(layer="disc").multiply([(0.2, 0.0)]).video()
+    assert copied.num_gaussians == video.num_gaussians + num
+    assert copied.layers[0].name == "disc"
+    script = '[selections.it]\nlayer = "disc"\n[[edits]]\nselect = "it"\ndo = "vanish"\n'
+    assert parse_edit_script(script).apply(video).num_gaussians == video.num_gaussians - num
+    with pytest.raises(ValueError, match=r"layer: expected a whole number in \[0, 1\] or 'disc' or 'background', got"):
+        edit(video).select(layer="disk")
+    with pytest.raises(EditScriptError, match=r"\[selections.it\]: layer: expected a whole number"):
+        parse_edit_script(script.replace('"disc"', '"disk"')).apply(video)
+
+
+# ----------------------------------------------------------------------------------------------------- files
+
+
+def test_files_hold_layers_by_name(fitted, tmp_path):
+    video, results = fitted
+    save_compact(tmp_path / "a.fgz", {name: result.quantized for name, result in results.items()}, metadata={"a": 1})
+    save_video_model(tmp_path / "a.safetensors", video)
+    wanted = video.render(0.4)
+    for name in ("a.fgz", "a.safetensors"):
+        found = load_video_model(tmp_path / name)
+        assert [layer.name for layer in found.layers] == ["disc", "background"]
+        assert (found.render(0.4) == wanted).all()
+
+
+def test_layers_are_found_from_the_page_of_the_format_alone(fitted, tmp_path):
+    _, results = fitted
+    path = save_compact(tmp_path / "a.fgz", {name: result.quantized for name, result in results.items()})
+    parts = split_layers(path.read_bytes())
+    assert list(parts) == ["background", "disc"]
+    for name, data in parts.items():
+        assert len(read(data)[1]["loc"]) == results[name].model.num_gaussians
+
+
+def test_a_part_of_a_file_has_the_background(fitted, tmp_path):
+    _, results = fitted
+    path = save_compact(tmp_path / "a.fgz", {name: result.quantized for name, result in results.items()})
+    data, alone = path.read_bytes(), save_compact(tmp_path / "b.fgz", {"background": results["background"].quantized})
+    size = len(alone.read_bytes())
+    assert data[:size] == alone.read_bytes()
+    for damaged in (data[: size + 10], data[:size] + bytes(20), data[: size + 40] + b"#" + data[size + 41 :]):
+        path.write_bytes(damaged)
+        with pytest.warns(UserWarning, match="a layer is cut off or damaged"):
+            found = load_video_model(path)
+        assert isinstance(found, EditedVideo)
+        assert [layer.name for layer in found.layers] == ["background"]
+    path.write_bytes(data[: size // 2])
+    with pytest.raises(ModelFileError, match="cut off or damaged"):
+        load_video_model(path)
+
+
+@pytest.fixture
+def folders(clip, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    frames, _, masks = clip
+    write_frames(tmp_path / "clip", frames)
+    write_frames(tmp_path / "masks", np.repeat(255 * np.uint8(masks)[..., None], 3, -1))
+    return tmp_path
+
+
+FIT = ("fit", "clip", "--masks", "masks", "--steps", 60, "--out", "a.fgz", "--quiet")
+
+
+def test_the_command_fits_layers(folders, clip):
+    told = "of what is behind objects is shown by no frame"
+    call(*FIT[:-1], out=["object: 8 frames of 90x160 with alpha", "background: 8 frames"], err=["background: ", told])
+    whole = (folders / "a.fgz").read_bytes()
+    assert [layer.name for layer in load_video_model("a.fgz").layers] == ["object", "background"]
+    assert not list(folders.glob("*.checkpoint"))
+    call("info", "a.fgz", out="layer 0")
+    call("evaluate", "a.fgz", "clip")
+    call(*FIT, "--overwrite")
+    assert (folders / "a.fgz").read_bytes() == whole
+    call(*FIT[:2], "--masks", "moving", *FIT[4:], "--overwrite")
+    assert len(load_video_model("a.fgz").layers) == 2
+    call("fit", "clip", "--masks", "masks", "--steps", 40, "--out", "a.safetensors", "--quiet")
+    assert [layer.name for layer in load_video_model("a.safetensors").layers] == ["object", "background"]
+
+
+@pytest.mark.parametrize("stop", [30, 90])
+def test_a_stopped_fit_continues_in_its_layer(folders, monkeypatch, stop):
+    call(*FIT)
+    whole = (folders / "a.fgz").read_bytes()
+    taken, steps = [], runner.fit_steps
+
+    def killed(*arguments, **options):
+        for one in steps(*arguments, **options):
+            yield one
+            taken.append(one)
+            if len(taken) == stop:
+                raise KeyboardInterrupt
+
+    monkeypatch.setattr(runner, "fit_steps", killed)
+    call(*FIT, "--overwrite", "--checkpoint-seconds", 0, code=130)
+    assert list(folders.glob("*.checkpoint"))
+    monkeypatch.setattr(runner, "fit_steps", steps)
+    call(*FIT)
+    assert (folders / "a.fgz").read_bytes() == whole
+
+
+def test_segments_have_layers(folders):
+    call(*FIT, "--segment-seconds", 0.2, "--frames", "0:8")
+    video = load_video_model("a.fgz")
+    assert [[layer.name for layer in one.model.layers] for one in video.segments] == 2 * [["object", "background"]]
+    assert edit(video).select(layer="object").vanish().video().num_gaussians < video.num_gaussians
+
+
+def test_masks_of_the_whole_clip_are_cut(folders, clip):
+    _, _, masks = clip
+    part = read_object_masks("masks", 2, 3, SIZE)
+    assert (part["object"] == masks[2:5]).all()
+    labels = np.uint8(masks) + 0
+    labels[:, :10, :10] = 7
+    write_frames(folders / "two", np.repeat(labels[..., None], 3, -1))
+    both = read_object_masks("two", 0, 8, SIZE)
+    assert list(both) == ["object 1", "object 7"]
+    assert (both["object 1"] == (labels == 1)).all()
+    call("fit", "clip", "--masks", "two", "--frames", "0:4", "--steps", 5, "--out", "b.fgz", "--quiet")
+    call("fit", "clip", "--masks", "nothing", code=2, err="nothing")
+    call(
+        "fit",
+        "clip",
+        "--masks",
+        next((folders / "masks").iterdir()),
+        code=2,
+        err="masks: expected one for each of 8 frames",
+    )
+    call(
+        "fit",
+        "clip",
+        "--masks",
+        "masks",
+        "--history",
+        "h.jsonl",
+        code=2,
+        err="--history: expected a fit without layers",
+    )
+
+
+def test_a_clip_with_alpha_has_no_masks(folders, clip):
+    frames, _, masks = clip
+    write_frames(folders / "cut", np.concatenate([frames * masks[..., None], 255 * np.uint8(masks)[..., None]], -1))
+    assert read_video("cut").has_alpha
+    call("fit", "cut", "--masks", "masks", code=2, err="masks: expected a clip without alpha")
