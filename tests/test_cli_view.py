@@ -59,12 +59,12 @@ def test_view_finds_what_moves(served, work, monkeypatch):
     monkeypatch.setattr(selectors, "find_moving_object", search)
     told, pages = served(work / "model.safetensors", "--moving-object")[2:0:-1]
     assert "The page has no button for the moving object: moving: expected" in " ".join(told.err.split())
-    assert 'id="moving"' not in pages[0][1]
+    assert 'id="objects">{}<' in pages[0][1]
     masks = np.ones((NUM_FRAMES, *load_video_model(work / "model.safetensors").size), bool)
     monkeypatch.setattr(selectors, "find_moving_object", lambda frames: masks)
     code, ((_, page),), told, _ = served(work / "model.safetensors", "--moving-object")
     assert (code, told.err) == (0, "")
-    assert re.search(r'id="moving">{"0": "0-\d+', page)
+    assert re.search(r'id="objects">{"the moving object": {"0": "0-\d+', page)
 
 
 def test_view_serves_a_page_and_opens_it(served, work):

@@ -5,10 +5,10 @@ values are in the units of `Edit`:
 
 - `[selections.NAME]`: `indices` (numbers and ranges of Gaussians, "3,17,40-52", with `num_gaussians`, which is
   checked, and, of a video in segments, the number of a `segment`), `mask` (an image, folder or video, with `label`,
-  `level`), or
-  `layer` (a number or a name), `box`, `polygon`, `color`, `click`, `moving`, `times`, with `frame`, `frames`,
-  `tolerance`, `alive`, `threshold`, `follow`, as `foldgauss.video.select` takes them; or `any`, `all`, `without`: lists of earlier names, for the union,
-  the intersection and the difference. All are evaluated on the video before the first edit.
+  `level`), `layer` (a number or a name), or `box`, `polygon`, `color`, `click`, `moving`, `times`, with `frame`,
+  `frames`, `tolerance`, `alive`, `threshold`, `follow`, as `foldgauss.video.select` takes them; or `any`, `all`,
+  `without`: lists of earlier names, for the union, the intersection and the difference. All are evaluated on the video
+  before the first edit.
 - `[[edits]]`, applied in order: `do` is one of `ACTIONS`, `select` a name (default: the current selection, at first
   everything), with the action's own keys; `frame`, `frames` or `times`, with `ease` and `curve`, for the span.
 - `frames` is `[first, stop]`, or "first:stop" where either may be left out: "10:" is open at the end.

@@ -19,10 +19,11 @@ from editor_page import (
 )
 from soft_models import NUM, NUM_FRAMES, SIZE, soft_model
 
-from foldgauss.io import html_page, load_video_model
+from foldgauss.io import html_page, load_video_model, save_compact, write_html
 from foldgauss.io.edit_script import parse_edit_script
+from foldgauss.io.page.player_page import quantize_finely
 from foldgauss.render import RenderOptions
-from foldgauss.video import SegmentedVideo, by_mask
+from foldgauss.video import EditedVideo, Layer, SegmentedVideo, by_mask
 from foldgauss.video.selection import selectors
 from foldgauss.video.selection.tracking import to_lab
 
@@ -109,7 +110,7 @@ def test_a_button_selects_what_moves(browser, compact, tmp_path, monkeypatch):
         path.write_text(html_page(model, moving=True))
         page = Opened(browser, path).ready()
         page.press("e")
-        page.page.click("#select-moving")
+        page.page.click("text=Select the moving object")
         expected = [set(np.flatnonzero(by_mask(one, masks).mask).tolist()) for one in parts]
         assert all(5 < len(found) < NUM - 5 for found in expected)
         for time, found in zip((0.2, 0.8), (expected[0], expected[-1]), strict=True):
@@ -122,8 +123,28 @@ def test_a_button_selects_what_moves(browser, compact, tmp_path, monkeypatch):
     plain = Opened(browser).go(tmp_path / "clip.html")
     path.write_text(html_page(compact))
     plain.go(path).ready().page.keyboard.press("e")
-    assert plain.page.locator("#select-moving").is_hidden()
+    assert not plain.page.locator("#select-objects button").count()
     plain.close()
+
+
+def test_layers_have_buttons(browser, compact, tmp_path):
+    model = load_video_model(compact)
+    names = {"front": model, "<b>back": model}
+    video = EditedVideo(tuple(Layer(one, name=name) for name, one in names.items()))
+    save_compact(tmp_path / "two.fgz", {name: quantize_finely(one) for name, one in names.items()})
+    for number, shown in enumerate((video, tmp_path / "two.fgz")):
+        path = write_html(tmp_path / f"{number}.html", shown, linked=bool(number))
+        page = Opened(browser, path).ready() if not number else None
+        if page is None:
+            assert (tmp_path / "1.page.fgz").exists()  # of one model, which the page decodes
+            continue
+        page.press("e")
+        assert page.page.locator("#select-objects button").all_text_contents() == ["Select front", "Select <b>back"]
+        page.page.locator("#select-objects button").last.click()
+        page.page.evaluate("(t) => foldgauss.seek(t)", 0.5)
+        assert min(picked(page)) >= NUM
+        page.check()
+        page.close()
 
 
 def test_a_selection_grows_and_shrinks(opened, compact):

@@ -176,15 +176,6 @@ def test_files_hold_layers_by_name(fitted, tmp_path):
         assert (found.render(0.4) == wanted).all()
 
 
-def test_layers_are_found_from_the_page_of_the_format_alone(fitted, tmp_path):
-    _, results = fitted
-    path = save_compact(tmp_path / "a.fgz", {name: result.quantized for name, result in results.items()})
-    parts = split_layers(path.read_bytes())
-    assert list(parts) == ["background", "disc"]
-    for name, data in parts.items():
-        assert len(read(data)[1]["loc"]) == results[name].model.num_gaussians
-
-
 def test_a_part_of_a_file_has_the_background(fitted, tmp_path):
     _, results = fitted
     path = save_compact(tmp_path / "a.fgz", {name: result.quantized for name, result in results.items()})

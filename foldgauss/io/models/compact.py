@@ -240,6 +240,11 @@ def compact_metadata(path: Path) -> dict:
     return _read_header(path, path.read_bytes())["metadata"]
 
 
+def has_layers(path: PathLike) -> bool:
+    """Whether a compact file holds a video of layers."""
+    return "layer" in _read_header(Path(path), Path(path).read_bytes())
+
+
 def measure_chunks(path: Path) -> tuple[list[int], int]:
     """Sizes of the chunks and of the file in bytes, as the header states them. The file itself may be cut off."""
     header = _read_header(path, path.read_bytes())

@@ -24,7 +24,7 @@ from jaxtyping import UInt8
 from foldgauss._runtime.checks import is_integer, require, short_repr
 from foldgauss.io._atomic import PathLike, atomic_path, check_path
 from foldgauss.io.media.clip import Clip
-from foldgauss.io.models.compact import COMPACT_SUFFIX, is_compact, pack_compact
+from foldgauss.io.models.compact import COMPACT_SUFFIX, has_layers, is_compact, pack_compact
 from foldgauss.io.models.selections import format_indices
 from foldgauss.io.models.video_model import keep_origin, load_video_model, read_frame_seconds, read_origin
 from foldgauss.video.compression.quantize import (
@@ -37,12 +37,12 @@ from foldgauss.video.compression.quantize import (
     is_integral,
     quantize,
 )
-from foldgauss.video.editing.edited_video import EditedVideo
+from foldgauss.video.editing.edited_video import EditedVideo, as_edited
 from foldgauss.video.models.video_model import VideoModel
 from foldgauss.video.motion.moving_object import NothingMoves, nothing_moves
 from foldgauss.video.segmented.layering import flatten_video
 from foldgauss.video.segmented.segmented_video import SegmentedVideo
-from foldgauss.video.selection.selectors import by_motion
+from foldgauss.video.selection.selectors import Selection, by_motion
 
 HTML_SUFFIX = ".html"
 #: WebP quality of the original's frames.
@@ -51,6 +51,8 @@ QUALITY = 80
 LARGE = 50e6
 #: Bytes above which notebooks do not show a page automatically.
 LARGEST_IN_NOTEBOOK = 20e6
+#: The name of the object that moves, on its button.
+MOVING = "the moving object"
 _SOURCES = Path(__file__).parent / "player"
 _DECODER = Path(__file__).parent / "compact.js"
 _IMPORT = re.compile(r'^import (?:(?P<names>\{[^}]*\})|(?P<text>\w+)) from "\./(?P<name>[\w.-]+)";\n', re.MULTILINE)
@@ -108,7 +110,7 @@ def write_html(
 
 def linked_file(path: Path, model: Model) -> Path:
     """The compact file that a page with this path reads its model from."""
-    if isinstance(model, PathLike) and is_compact(model) and Path(model).parent.resolve() == path.parent.resolve():
+    if isinstance(model, PathLike) and _is_plain(model) and Path(model).parent.resolve() == path.parent.resolve():
         return Path(model)
     return path.with_name(f"{path.stem}.page{COMPACT_SUFFIX}")  # of no model that someone keeps
 
@@ -182,7 +184,8 @@ def html_page(
     plain, name, metadata = _load(model)
     pictures = [] if original is None else list(_encode_original(original, plain, quality))
     models = _encode_model(model, plain, metadata) if linked is None else [_link(plain, linked)]
-    blocks = [*models, *([_encode_moving(plain)] if moving else []), *pictures]
+    objects = json.dumps(_find_objects(plain, moving)).replace("<", "\\u003c")
+    blocks = [*models, f'<script type="application/json" id="objects">{objects}</script>', *pictures]
     return _assemble(blocks, name if title is None else title, save_to, connects=linked is not None)
 
 
@@ -251,9 +254,14 @@ def _encode_model(model: Model, loaded: Loaded, metadata: dict) -> Iterator[str]
 
 def _pack(model: Model, loaded: VideoModel | EditedVideo, metadata: dict) -> bytes:
     """The compact file of a single model; one that is compact already is not changed."""
-    if loaded is not model and is_compact(model):
+    if loaded is not model and _is_plain(model):
         return Path(model).read_bytes()
     return pack_compact(quantize_finely(flatten_video(loaded)), metadata)
+
+
+def _is_plain(path: PathLike) -> bool:
+    """Whether a file is a compact one of a single model, which the page decodes."""
+    return is_compact(path) and not has_layers(path)
 
 
 def _link(loaded: Loaded, name: str) -> str:
@@ -269,19 +277,28 @@ def _link(loaded: Loaded, name: str) -> str:
     return f'<script type="application/octet-stream" id="model" data-url="{url}"></script>'
 
 
-def _encode_moving(model: Loaded) -> str:
-    """The Gaussians of the moving object, by segment, as the page writes selections."""
-    models = (one.model for one in model.segments) if isinstance(model, SegmentedVideo) else [model]
-    found, missing = {}, None
+def _find_objects(model: Loaded, moving: bool) -> dict[str, dict[int, str]]:
+    """The Gaussians of each layer with a name, and of what is `moving`, by segment, as the page writes selections."""
+    models = [one.model for one in model.segments] if isinstance(model, SegmentedVideo) else [model]
+    found: dict[str, dict[int, str]] = {}
+    missing = None
     for number, one in enumerate(models):
+        first = 0
+        for layer in as_edited(one).layers:
+            own = np.zeros(one.num_gaussians, bool)
+            own[first : first + layer.num_gaussians] = True
+            first += layer.num_gaussians
+            if layer.name:
+                found.setdefault(layer.name, {})[number] = format_indices(Selection(own))
         try:
-            found[number] = format_indices(by_motion(flatten_video(one)))
+            text = format_indices(by_motion(flatten_video(one))) if moving else ""
         except NothingMoves as error:
-            missing = error
-    found = {number: text for number, text in found.items() if text}
-    if not found:
+            missing, text = error, ""
+        if text:
+            found.setdefault(MOVING, {})[number] = text
+    if moving and MOVING not in found:
         raise missing or nothing_moves("an object that has Gaussians of its own", "none")
-    return f'<script type="application/json" id="moving">{json.dumps(found)}</script>'
+    return found
 
 
 def quantize_finely(model: VideoModel) -> Quantized:

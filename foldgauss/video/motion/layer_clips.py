@@ -24,6 +24,8 @@ BAND = 0.0025
 COLOR_ERROR = 50.0
 #: blurred by a filter with this standard deviation, in pixels.
 EDGE = 0.7
+#: A background of which less than this fraction is seen stays as other frames show it.
+LEAST_SEEN = 0.1
 #: The name of the layer behind all objects.
 BACKGROUND = "background"
 
@@ -62,11 +64,16 @@ def separate(
 
     def cut(k: int) -> None:
         background[k] = np.where(cv2.dilate(np.uint8(whole[k]), kernel)[..., None], background[k], frames[k])
-        behind = background[k].astype(np.float32)
+        image, behind = frames[k].astype(np.float32), background[k].astype(np.float32)
+        front, seen = np.zeros_like(behind), np.ones_like(behind[..., :1])
         for name, mask in reversed(masks.items()):
             if mask[k].any():
-                layers[name][k] = own = _cut_out(frames[k].astype(np.float32), np.uint8(mask[k]), behind, kernel)
-                behind = own[..., :3] + (1 - own[..., 3:] / np.float32(255)) * behind
+                layers[name][k] = own = _cut_out(image, np.uint8(mask[k]), seen * behind + front, kernel)
+                transmitted = 1 - own[..., 3:] / np.float32(255)
+                front, seen = own[..., :3] + transmitted * front, transmitted * seen
+        # Where the object's color cannot make up for the background, the background is changed.
+        rest = np.clip((image - front) / np.maximum(seen, LEAST_SEEN), 0, 255).round().astype(np.uint8)
+        background[k] = np.where(seen > LEAST_SEEN, rest, background[k])
 
     run_tasks(cut, range(len(frames)))
     return layers | {BACKGROUND: background}, unknown

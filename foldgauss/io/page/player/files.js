@@ -70,7 +70,12 @@ export class Files {
       changed();
     };
     element("save-disk").hidden = element("save-about").hidden = !server || !this.isOfPage;
-    element("select-moving").hidden = !this.isOfPage || !element("moving");
+    const objects = this.isOfPage && element("objects") ? JSON.parse(element("objects").textContent) : {};
+    element("select-objects").replaceChildren(...Object.entries(objects).map(([name, select]) => {
+      const button = Object.assign(document.createElement("button"), { type: "button", textContent: `Select ${name}` });
+      button.onclick = () => history.push({ select });
+      return button;
+    }));
     if (server) put("save-about", `As ${server.script}`);
     element("download-model").disabled = segments.spans.length > 1;
     this.storage.version = server && this.isOfPage ? element("script")?.dataset.version ?? NO_SCRIPT : undefined;

@@ -5,7 +5,7 @@ import { UNFINISHED } from "./loading.js";
 import { filled, totalOf, totalOfStep } from "./totals.js";
 
 const BUTTONS = {
-  "select-all": "selectAll", "select-none": "selectNone", "select-moving": "selectMoving", invert: "invert", grow: "grow", shrink: "shrink",
+  "select-all": "selectAll", "select-none": "selectNone", invert: "invert", grow: "grow", shrink: "shrink",
 };
 const round = (own, digits = 6) => Number(own.toFixed(digits));
 const value = (name) => Number(element(name).value);

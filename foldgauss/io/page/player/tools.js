@@ -169,11 +169,6 @@ export class Tools {
     if (Object.keys(this.player.editing.selection).length) this.player.editing.selectNone();
   }
 
-  /** Select what moves, which was found when the page was written. */
-  selectMoving() {
-    this.player.editing.history.push({ select: JSON.parse(element("moving").textContent) });
-  }
-
   invert() {
     const { selected } = this.player.state, others = [];
     for (let i = 0; i < selected.length; i++) if (!selected[i]) others.push(i);
