@@ -29,7 +29,7 @@ from foldgauss.jobs.job import MOVING, FitJob, file_digest, limit_range, read_re
 from foldgauss.video import Evaluation, FitConfig, FitDiverged, FitState, VideoModel, evaluate
 from foldgauss.video.fitting.loop import FitInfo, finish, fit_steps
 from foldgauss.video.layered import LayerPlan, plan_layers, stack
-from foldgauss.video.motion.moving_object import find_moving_object
+from foldgauss.video.motion.moving_object import NothingMoves, find_moving_object
 
 #: Seconds between two checkpoints of a running fit.
 CHECKPOINT_SECONDS = 30.0
@@ -170,11 +170,15 @@ def _plan_layers(job: FitJob, clip: Clip) -> list[LayerPlan]:
         got=repr(clip.source),
         cure="Its alpha cuts out the object.",
     )
+    is_part, masks = job.index is not None, {}  # in a part there may be no object
     if job.masks == MOVING:
-        masks = {"object": find_moving_object(clip.frames)}
+        with suppress(NothingMoves) if is_part else nullcontext():
+            masks = {"object": find_moving_object(clip.frames)}
     else:
         begin = (job.metadata.get("frames") or job.frames or (0,))[0] or 0
-        masks = read_object_masks(job.masks, begin, clip.num_frames, clip.size)
+        found = read_object_masks(job.masks, begin, clip.num_frames, clip.size)
+        masks = {name: own for name, own in found.items() if own.any()}
+    require(masks or is_part, "masks", expected="an object in these frames", got=f"none in {job.masks!r}")
     return plan_layers(clip.frames, masks, job.config)
 
 

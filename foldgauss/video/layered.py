@@ -13,7 +13,7 @@ from foldgauss.video.fitting.loop import FitInfo, FitResult, finish, fit_steps
 from foldgauss.video.fitting.state import FitState
 from foldgauss.video.models.video_model import VideoModel
 from foldgauss.video.motion.background_plate import Frames
-from foldgauss.video.motion.layer_clips import separate
+from foldgauss.video.motion.layer_clips import BACKGROUND, separate
 from foldgauss.video.motion.optical_flow import motion_finder
 
 #: An object changes more from frame to frame than the background, whose motion is the camera's: so many times as many
@@ -38,9 +38,9 @@ def plan_layers(
 
     Frame times are not learned, so that they are the same in all layers. `minutes` and `size_mb` are divided by the
     areas of the layers, where a pixel of an object counts `OBJECT_SHARE`. A PSNR is that of the visible pixels: errors
-    are then the same in all layers, as with one λ.
+    are then the same in all layers, as with one λ. Without masks, the background is the only one.
     """
-    parts, unknown = separate(frames, masks)
+    parts, unknown = separate(frames, masks) if masks else ({BACKGROUND: frames}, 0.0)
     cuts = motion_finder(frames)().cuts
     areas = [OBJECT_SHARE * mask.mean() for mask in masks.values()]
     shares = np.array([*areas, 1.0]) / (sum(areas) + 1)

@@ -81,6 +81,15 @@ def test_two_objects_that_touch_leave_no_gap():
     assert np.abs(composite(layers).astype(int) - frames)[one | other].max() <= 1
 
 
+@pytest.mark.parametrize("num", [1, 2])
+def test_short_clips_have_layers(clip, num):
+    frames, masks = clip[0][:num], clip[2][:num]
+    layers, unknown = separate(frames, {"disc": masks})
+    assert unknown > 0.5
+    assert min(map(psnr, frames, composite(layers))) > 40
+    assert (layers["background"][masks] > 20).any(-1).mean() > 0.99  # nothing black
+
+
 @pytest.mark.parametrize(
     ("masks", "told"),
     [
@@ -247,6 +256,21 @@ def test_segments_have_layers(folders):
     video = load_video_model("a.fgz")
     assert [[layer.name for layer in one.model.layers] for one in video.segments] == 2 * [["object", "background"]]
     assert edit(video).select(layer="object").vanish().video().num_gaussians < video.num_gaussians
+
+
+def test_segments_without_an_object_have_a_background_only(folders, clip):
+    masks = clip[2].copy()
+    masks[:5] = False
+    write_frames(folders / "late", np.repeat(255 * np.uint8(masks)[..., None], 3, -1))
+    call(*FIT[:3], "late", *FIT[4:], "--segment-seconds", 0.16, "--frames", "0:8")
+    video = load_video_model("a.fgz")
+    names = [[layer.name for layer in one.model.layers] for one in video.segments]
+    assert names[0] == ["background"]
+    assert names[-1] == ["object", "background"]
+    assert edit(video).select(layer="object").vanish().video().num_gaussians < video.num_gaussians
+    with pytest.raises(ValueError, match="selection: expected at least one Gaussian"):
+        edit(video).select(layer="objekt").vanish().video()
+    call(*FIT[:3], "late", *FIT[4:], "--frames", "0:4", "--overwrite", code=2, err="masks: expected an object in these")
 
 
 def test_masks_of_the_whole_clip_are_cut(folders, clip):

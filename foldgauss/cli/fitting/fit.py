@@ -11,7 +11,7 @@ import typer
 
 from foldgauss._runtime.checks import require
 from foldgauss._runtime.threads import num_threads
-from foldgauss.cli.app.application import Stopped, command, err, warn
+from foldgauss.cli.app.application import Stopped, command, err, out, warn
 from foldgauss.cli.app.signals import note_signals
 from foldgauss.cli.fitting.job_progress import describe_continuation, report_fit, summarize_fit
 from foldgauss.cli.fitting.options import (
@@ -214,6 +214,8 @@ def fit_with_progress(
             except FitDiverged as error:
                 raise Stopped(str(error)) from error
 
+    if job.masks is not None and display in ("bar", "lines"):
+        out.print("Taking the objects out of the background ...")
     try:
         record = run_fit(
             job,

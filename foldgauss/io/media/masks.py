@@ -98,33 +98,31 @@ def read_object_masks(
 ) -> dict[str, Bool[np.ndarray, "num_frames height width"]]:
     """The masks of each object, by name, for `num_frames` frames of `size`, from frame `first` of the clip on.
 
-    A folder of label images, one for each frame of the clip or of the part: objects are called "object", or "object 1",
+    A folder of label images, one for each frame of the clip or of the part, or an image of one frame: objects are called "object", or "object 1",
     "object 2" by their labels; a video has one. Masks are cropped to the aspect of `size` around the center, then
-    resized. Raises as `read_masks`, and ValueError for another number of masks, and where no object is in them.
+    resized. Those of some objects may be empty in a part. Raises as `read_masks`, and ValueError for another number of
+    masks, and where no object is in them.
     """
     path = check_path(path)
-    check_input(path, "a folder or a video")
-    if path.is_dir():
-        labels = read_labels(choose_images(path, 0, None))
+    check_input(path, "a folder, an image or a video")
+    if path.is_dir() or path.suffix.lower() in IMAGE_SUFFIXES:
+        labels = read_labels(choose_images(path, 0, None) if path.is_dir() else [path])
         numbers = sorted(set(np.unique(labels).tolist()) - {0, VOID})
         masks = {f"object {k}" if len(numbers) > 1 else "object": labels == k for k in numbers}
     else:
         masks = {"object": read_masks(path)}
-    found = {}
+    require(any(map(np.any, masks.values())), "masks", expected="an object in them", got=f"none in {str(path)!r}")
     for name, own in masks.items():
         own = own[first:] if len(own) >= first + num_frames else own
         require(
-            own.ndim == 3 and len(own) >= num_frames,
+            len(own) >= num_frames,
             "masks",
             expected=f"one for each of {num_frames} frames",
             got=f"{len(own)} in {str(path)!r}",
         )
         own = np.uint8(own[:num_frames, *aspect_window(own.shape[1:], size)])
-        own = np.stack([cv2.resize(mask, size[::-1], interpolation=cv2.INTER_NEAREST) > 0 for mask in own])
-        if own.any():
-            found[name] = own
-    require(found, "masks", expected="an object in them", got=f"none in {str(path)!r}")
-    return found
+        masks[name] = np.stack([cv2.resize(mask, size[::-1], interpolation=cv2.INTER_NEAREST) > 0 for mask in own])
+    return masks
 
 
 def _select_label(paths: list[Path], label: int | None, source: Path) -> Bool[np.ndarray, "num_frames height width"]:

@@ -106,13 +106,13 @@ def resize_frames(frames: Frames) -> UInt8[np.ndarray, "frames rows columns 3"]:
     return np.stack([cv2.resize(frame, size, interpolation=how) for frame in frames])
 
 
-def check_frames(frames: np.ndarray) -> None:
-    """Raise ValueError unless these are three color frames at least."""
+def check_frames(frames: np.ndarray, least: int = 3) -> None:
+    """Raise ValueError unless these are color frames, three of them at least or as many as given."""
     shape, dtype = np.shape(frames), getattr(frames, "dtype", None)
     require(
-        len(shape) == 4 and shape[0] >= 3 and shape[-1] == 3 and 0 not in shape and dtype == np.uint8,
+        len(shape) == 4 and shape[0] >= least and shape[-1] == 3 and 0 not in shape and dtype == np.uint8,
         "frames",
-        expected="uint8 (num_frames, height, width, 3) of 3 frames at least",
+        expected=f"uint8 (num_frames, height, width, 3) of {least} or more frames",
         got=f"{type(frames).__name__ if dtype is None else dtype} {shape}",
     )
 

@@ -49,7 +49,7 @@ def separate(
 
     Example: `separate(clip.frames, {"ball": masks})[0]["ball"]`.
     """
-    check_frames(frames)
+    check_frames(frames, 1)
     require(
         masks and BACKGROUND not in masks, "masks", expected="at least one, not called 'background'", got=list(masks)
     )

@@ -126,13 +126,13 @@ class SegmentedEdit:
         self,
         selection: Selection | Mask | Callable[[SegmentedVideo], Selection] | None = None,
         *,
-        layer: int | None = None,
+        layer: int | str | None = None,
         **criteria: Any,
     ) -> "SegmentedEdit":
         """Choose the Gaussians that the next edits apply to, from all Gaussians; without arguments, all of them.
 
-        As `Edit.select`; a mask is over the Gaussians of one segment after another. Criteria are evaluated at once, on
-        one model after another.
+        As `Edit.select`, but segments may lack the `layer` with a name; a mask is over the Gaussians of one segment
+        after another. Criteria are evaluated at once, on one model after another.
         """
         check_select_arguments(selection, criteria)
         if criteria:
@@ -141,7 +141,7 @@ class SegmentedEdit:
             evaluator = CriteriaEvaluator(segments, stand_in, self._replay, self._select_none, layer)
             return self._select_current(evaluator.evaluate(list_criteria(**criteria)))
         if selection is None:
-            return self._record_selection(lambda one, number: one.select(layer=layer), None)
+            return self._record_selection(lambda one, number: _select_layer(one, layer), None)
         if callable(selection):
             check_signature("selection", selection, "video")
             video = self.video()
@@ -248,6 +248,12 @@ def _segment_sizes(video: SegmentedVideo) -> list[int]:
 def _split_selection(selection: object, counts: list[int]) -> list[Selection]:
     """By segment, from a selection in all."""
     return list(map(Selection, split_mask(check_mask(selection, sum(counts)), counts)))
+
+
+def _select_layer(one: Edit, layer: int | str | None) -> Edit:
+    """A layer of a segment; nothing where an object is not in it."""
+    lacks = isinstance(layer, str) and layer not in (own.name for own in one._video.layers)
+    return _deselect_all(one) if lacks else one.select(layer=layer)
 
 
 def _deselect_all(one: Edit) -> Edit:
