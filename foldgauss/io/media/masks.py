@@ -98,10 +98,10 @@ def read_object_masks(
 ) -> dict[str, Bool[np.ndarray, "num_frames height width"]]:
     """The masks of each object, by name, for `num_frames` frames of `size`, from frame `first` of the clip on.
 
-    A folder of label images, one for each frame of the clip or of the part, or an image of one frame: objects are called "object", or "object 1",
-    "object 2" by their labels; a video has one. Masks are cropped to the aspect of `size` around the center, then
-    resized. Those of some objects may be empty in a part. Raises as `read_masks`, and ValueError for another number of
-    masks, and where no object is in them.
+    A folder of label images, one for each frame of the clip or of the part, or an image of one frame: objects are
+    called "object", or "object 1", "object 2" by their labels; a video has one. Masks are cropped to the aspect of
+    `size` around the center, then resized. Those of some objects may be empty in a part. Raises as `read_masks`, and
+    ValueError for another number of masks, and where no object is in them.
     """
     path = check_path(path)
     check_input(path, "a folder, an image or a video")

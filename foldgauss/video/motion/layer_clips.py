@@ -9,6 +9,7 @@ from jaxtyping import Bool, Float32, UInt8
 from foldgauss._runtime.checks import require
 from foldgauss._runtime.threads import run_tasks
 from foldgauss.video.motion.background_plate import (
+    MARGIN,
     Alignment,
     Frames,
     check_frames,
@@ -59,12 +60,22 @@ def separate(
     side = max(frames.shape[1:3])
     kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * max(round(BAND * side), 1) + 1,) * 2)
     whole = np.any(list(masks.values()), axis=0)
-    background, unknown = complete_background(frames, cover(whole), alignment)
+    covered, spread = cover(whole), MARGIN * side
+    background, unknown = complete_background(frames, covered, alignment)
     layers = {name: np.zeros((*frames.shape[:3], 4), np.uint8) for name in masks}
 
     def cut(k: int) -> None:
-        background[k] = np.where(cv2.dilate(np.uint8(whole[k]), kernel)[..., None], background[k], frames[k])
+        if not whole[k].any():
+            return
         image, behind = frames[k].astype(np.float32), background[k].astype(np.float32)
+        # What differs in brightness at the border, such as the object's shadow, fades inwards.
+        outside = cv2.dilate(np.uint8(whole[k]), kernel) == 0
+        border = np.float32(covered[k] & outside)
+        shift = cv2.GaussianBlur(border[..., None] * (image - behind), (0, 0), spread)
+        shift /= np.maximum(cv2.GaussianBlur(border, (0, 0), spread), 1e-6)[..., None]
+        fade = np.minimum(2 * cv2.GaussianBlur(np.float32(outside), (0, 0), spread), 1)[..., None]
+        behind = np.where(outside[..., None], image, np.clip(behind + fade * shift, 0, 255))
+        background[k] = behind.round()
         front, seen = np.zeros_like(behind), np.ones_like(behind[..., :1])
         for name, mask in reversed(masks.items()):
             if mask[k].any():
