@@ -79,8 +79,8 @@ def interrupted_fit(step, number=signal.SIGINT):
     """A fit sends its own process this signal after a step."""
     steps = runner.fit_steps
 
-    def stepping(*arguments):
-        for state, info in steps(*arguments):
+    def stepping(*arguments, **options):
+        for state, info in steps(*arguments, **options):
             if info.step == step:
                 os.kill(os.getpid(), number)
             yield state, info

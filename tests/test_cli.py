@@ -387,8 +387,8 @@ def test_overwrite_forgets_a_stopped_fit(work, tmp_path, monkeypatch):
     assert kept.exists()
 
     def killed(after):
-        def stepping(*given):
-            yield from itertools.islice(steps(*given), after)
+        def stepping(*given, **options):
+            yield from itertools.islice(steps(*given, **options), after)
             raise OSError("killed")
 
         return stepping

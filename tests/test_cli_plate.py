@@ -117,7 +117,7 @@ def test_own_masks_are_used_and_stay(model, tmp_path, monkeypatch, form):
     told = call("render", "--plate", model, "--masks", masks, "--out", "images", "--save-masks", "used")
     assert "Searching" not in told.out
     assert "% of the removed area is shown by no frame" in told.err
-    assert "It is a smear: take more frames" in told.err
+    assert "filled with texture from its surroundings. Take more frames" in told.err
     np.testing.assert_array_equal(read_masks("used"), MASKS)
     np.testing.assert_array_equal(read_masks("masks"), given)
     for options in (["--out", "masks"], ["--save-masks", "masks"]):

@@ -117,7 +117,7 @@ def test_lines_in_a_log(clip, tmp_path, monkeypatch, capfd):
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_a_fit_stops_at_once_before_its_first_step(number, clip, tmp_path, monkeypatch):
-    def starting(*given):
+    def starting(*given, **options):
         signal.raise_signal(number)
         raise AssertionError("went on")
         yield

@@ -161,8 +161,8 @@ def filling(monkeypatch, disk, full_at, empty_at=None):
     """Fill the disk before step `full_at` is told, and empty it before `empty_at` is."""
     steps = runner.fit_steps
 
-    def stepping(*arguments):
-        for state, info in steps(*arguments):
+    def stepping(*arguments, **options):
+        for state, info in steps(*arguments, **options):
             if info.step == full_at:
                 disk.fill()
             if info.step == empty_at:

@@ -170,8 +170,8 @@ def test_a_table_without_room_leaves_the_fits(clip, tmp_path, monkeypatch):
 def test_stopped_by_hand(clip, tmp_path, monkeypatch):
     steps = runner.fit_steps
 
-    def stopping(frames, config, state=None):
-        for step in steps(frames, config, state):
+    def stopping(frames, config, state=None, **options):
+        for step in steps(frames, config, state, **options):
             if config.steps == 3:
                 os.kill(os.getpid(), signal.SIGINT)
             yield step
@@ -195,10 +195,10 @@ def test_stopped_by_hand(clip, tmp_path, monkeypatch):
 def test_a_point_that_fails_is_left_out(clip, tmp_path, monkeypatch):
     steps, arguments = runner.fit_steps, ["tradeoff", clip, "--out", tmp_path / "r", "--axes", "compositing", *SAME]
 
-    def failing(frames, config, state):
+    def failing(frames, config, state, **options):
         if config.compositing == "sum":
             raise FitDiverged("the loss is NaN", None)
-        return steps(frames, config, state)
+        return steps(frames, config, state, **options)
 
     with monkeypatch.context() as broken:
         broken.setattr(runner, "fit_steps", failing)

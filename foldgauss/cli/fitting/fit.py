@@ -79,8 +79,7 @@ def fit(
         str | None,
         typer.Option(
             metavar=f"PATH|{MOVING}",
-            help="Objects that get layers of their own: a folder with a label image for each frame, or a video; "
-            f"{MOVING}: the object that moves.",
+            help="Masks of objects: each gets a layer.",
         ),
     ] = None,
     overwrite: Overwrite = False,
