@@ -97,10 +97,9 @@ class FitJob:
 
     def remove_checkpoints(self) -> None:
         """Remove the files of the fit."""
-        for layer in itertools.count():
-            if not self.checkpoint_of(layer).exists():
-                return
-            self.checkpoint_of(layer).unlink()
+        files = itertools.takewhile(Path.exists, map(self.checkpoint_of, itertools.count()))
+        for file in reversed(list(files)):  # the first one is left if this is interrupted
+            file.unlink()
 
     @property
     def record(self) -> Path:

@@ -111,11 +111,12 @@ def run_fit(
     _limit_compiled(clip.frames.shape)
     span = {"frames": limit_range(job.frames, clip.num_declared)}
     about = describe_source(clip, job.config.seed) | span | describe_reading(clip) | job.metadata
-    models, compact, seconds, num_steps = {}, {}, 0.0, 0
+    models, compact, notes, seconds, num_steps = {}, {}, [], 0.0, 0
     for number, plan in enumerate(_plan_layers(job, clip)):
         hidden = f"{plan.unknown:.0%} of what is behind objects is shown by no frame: texture from around it is fitted."
-        notes = clip.notes * (not number) + (hidden,) * (plan.unknown > 0)
-        part = dataclasses.replace(clip, frames=plan.frames, source=plan.name or clip.source, notes=notes)
+        own = clip.notes * (not number) + (hidden,) * (plan.unknown > 0)
+        notes += own
+        part = dataclasses.replace(clip, frames=plan.frames, source=plan.name or clip.source, notes=own)
         checkpoint = Checkpoint(job.checkpoint_of(number), plan.config, fingerprint(part), on_checkpoint_error)
         state = checkpoint.load() if resume else None
         config = dataclasses.replace(plan.config, size_mb=leave_room(plan.config.size_mb, about))
@@ -154,7 +155,7 @@ def run_fit(
         "file_bytes": os.path.getsize(job.target),
         "file_digest": file_digest(job.target),
         "peak_bytes": peak_bytes(),
-        "notes": list(clip.notes),
+        "notes": notes,
         "warnings": missed_psnr(job.config, scores.mean_psnr),
     }
 

@@ -51,7 +51,7 @@ def plan_layers(
         if own.shape[3] == 4:
             changes["views.interpolation_fraction"] = 0.0
             if config.psnr is not None:
-                changes["psnr"] = config.psnr - 10 * math.log10((own[..., 3] > 0).mean())
+                changes["psnr"] = min(config.psnr - 10 * math.log10((own[..., 3] > 0).mean()), 99.0)
         plans.append(LayerPlan(name, own, config.replace(**changes), cuts, unknown * (own.shape[3] == 3)))
     return plans
 

@@ -88,7 +88,7 @@ def save_compact(
     path = check_path(path, "path, quantized")
     check_compact_name(path)
     layers = quantized if isinstance(quantized, Mapping) else {"": quantized}
-    data = [pack_compact(one, metadata, name) for name, one in reversed(layers.items())]
+    data = [pack_compact(one, {} if n else metadata, name) for n, (name, one) in enumerate(reversed(layers.items()))]
     with atomic_path(path) as temporary:
         temporary.write_bytes(b"".join(data))
     return path
