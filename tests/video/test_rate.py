@@ -275,10 +275,12 @@ def test_a_psnr_within_reach_is_reached_by_a_file_that_is_hardly_larger_than_tha
     frames = texture(6) if clip == "low contrast" else FRAMES.copy()
     frames[: 4 if clip == "half of it black" else 0] = 0
     config = dataclasses.replace(CONFIG, steps=400)
-    given = fit(frames, config)
-    wanted = evaluate(given.model, frames).mean_psnr - 1
+    given, shown = fit(frames, config), frames.any((1, 2, 3))
+    wanted = np.mean(np.array(evaluate(given.model, frames).psnr)[shown]) - 1
     made = fit(frames, dataclasses.replace(config, quality=None, psnr=wanted))
-    assert evaluate(made.model, frames).mean_psnr >= wanted - TOLERATED_DB
+    scores = evaluate(made.model, frames)
+    assert scores.mean_psnr >= wanted - TOLERATED_DB
+    assert np.mean(np.array(scores.psnr)[shown]) >= wanted - 6.5  # for which black frames make up by 6 dB each
     assert count_bytes(made.quantized) < 1.1 * count_bytes(given.quantized)
 
 

@@ -97,6 +97,9 @@ _RISKED_DB = 0.25
 _TRUSTED_FROM = 0.42
 #: Mean squared errors of a frame below this, in [0, 1], count as 0: its PSNR is at its maximum.
 _PERFECT = 1e-10
+#: A frame counts with at most so many dB more than the PSNR that is asked for: nearly perfect ones, such as black ones,
+#: do not make up for others.
+_MOST_OVER_DB = 6.0
 #: The gain of a model that was finished already, at most.
 _GAIN_OF_GIVEN = 0.2
 #: The fraction of the gain of an action that is sure.
@@ -420,8 +423,9 @@ class RateControl(DensityControl):
         kept = [worth.are_worth(coarseness, action.extent).sum() for coarseness in grid]
         costs = [bit_price(coarseness) * USUAL_BITS * num for coarseness, num in zip(grid, kept, strict=True)]
         part = _USUAL_COST * min(self._count_passes(state.plan) / _USUAL_PASSES, 1.0)
-        # All frames are assumed to differ by as many dB from now; each has at most 100.
-        typical = np.mean(-10 * np.log10(np.maximum(self._seen_errors(state), _PERFECT)))
+        # All frames are assumed to differ by as many dB from now.
+        least = max(_PERFECT, _error_at(self.config.psnr + _MOST_OVER_DB))
+        typical = np.mean(-10 * np.log10(np.maximum(self._seen_errors(state), least)))
         missing = self.config.psnr - typical + running_psnr(state)
         limit = part * action.extent**_COST_POWER * 255**2 * _error_at(missing) * self.frames[..., :3].size
         return float(grid[np.argmax(np.minimum(costs, limit))])  # the first of enough, or the most
@@ -434,7 +438,10 @@ class RateControl(DensityControl):
         return errors[is_seen] if is_seen.any() else np.array([10 ** (-0.1 * running_psnr(state))])
 
     def _psnr(self, model: VideoModel, which: Int[np.ndarray, " some"]) -> float:
-        """Mean PSNR of the frames `which`, dB; with alpha the lower one of each over black and over white."""
+        """Mean PSNR of the frames `which`, dB; with alpha the lower one of each over black and over white.
+
+        None counts with more than `_MOST_OVER_DB` above a PSNR that is asked for.
+        """
         begun = time.perf_counter()
         times = np.asarray(model.frame_times.times())[which]
         found = []
@@ -444,7 +451,8 @@ class RateControl(DensityControl):
             found.append([psnr_of(target, image) for target, image in zip(targets, images, strict=True)])
         each = (time.perf_counter() - begun) / len(which)
         self.trimming["psnr"] = _TRIALS * each * len(self.frames)
-        return float(np.min(found, axis=0).mean())
+        most = math.inf if self.config.psnr is None else self.config.psnr + _MOST_OVER_DB
+        return float(np.minimum(np.min(found, axis=0), most).mean())
 
     def _target(self, k: int, background: Background) -> np.ndarray:
         frame = self.frames[k]
