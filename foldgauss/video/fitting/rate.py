@@ -95,6 +95,8 @@ _FIRST_DROPPED_DB = 2.0
 _RISKED_DB = 0.25
 #: The fraction of the plan from which on the PSNR alone tells how much may be dropped.
 _TRUSTED_FROM = 0.42
+#: The fraction of the plan up to which Gaussians are added where a PSNR is out of reach of those that there are.
+_ADDED_UNTIL = 0.55
 #: Mean squared errors of a frame below this, in [0, 1], count as 0: its PSNR is at its maximum.
 _PERFECT = 1e-10
 #: A frame counts with at most so many dB more than the PSNR that is asked for: nearly perfect ones, such as black ones,
@@ -283,11 +285,10 @@ class RateControl(DensityControl):
         """How many Gaussians a PSNR needs besides those that there are; 0 if the rest of the fit may reach it alone."""
         config, num, shape = self.config, state.num_gaussians, self.frames.shape[:3]
         is_only_goal = config.psnr is not None and (config.quality, config.size_mb) == (None, None)
-        if not is_only_goal or action.progress >= _TRUSTED_FROM or not errors_are_known(state, config):
+        if not is_only_goal or action.progress > _ADDED_UNTIL or not errors_are_known(state, config):
             return 0
-        missing = (
-            config.psnr + _MARGIN_DB - self._psnr(self._model(state), self.sampled) - 2 * self._gain(state, action)
-        )
+        gain = self._gain(state, action) * (2 if action.progress < _TRUSTED_FROM else 1)
+        missing = config.psnr + _MARGIN_DB - self._psnr(self._model(state), self.sampled) - gain
         needed = num * 2 ** min(max(missing, 0.0), 1.0)  # as if twice as many raised it by 1 dB
         most = 2 * START_PER_TIME * time_per_pixel(config, *shape) * math.prod(shape)
         return round(min(needed, most, most_gaussians(config))) - num
