@@ -20,7 +20,7 @@ from foldgauss.io._atomic import OutputError, atomic_path
 from foldgauss.io.models.video_model import MODEL_SUFFIX, keep_origin, load_video_model, read_metadata
 from foldgauss.io.provenance import describe_reading
 from foldgauss.jobs.job import FitJob, file_digest, limit_range, stamp_clip
-from foldgauss.jobs.runner import mean_scores
+from foldgauss.jobs.runner import describe_fit, mean_scores
 from foldgauss.video import Evaluation, FitConfig, Segment, SegmentedVideo, plan_segments, psnr, ssim
 
 #: Default length of a segment.
@@ -78,7 +78,7 @@ class LongFit:
             return joined
         each = [read_metadata(job.target) for job in self.jobs]
         summed = [name for name in ("steps", "fit_seconds") if name in each[0]]
-        about = keep_origin(each[0], "version", "budget") | {name: sum(one[name] for one in each) for name in summed}
+        about = keep_origin(each[0], "version") | {name: sum(one[name] for one in each) for name in summed}
         join_segments(self.target, sources, metadata=self.metadata | mean_scores(joined) | about)
         return joined
 
@@ -172,7 +172,7 @@ def plan_long_fit(
     spans = plan_segments(index.num_frames, index.cuts, length=length, overlap=overlap)
     frames = limit_range(frames, index.num_declared)
     metadata = {"clip": clip.name, "seed": config.seed, "frames": frames, "clip_digest": index.digest}
-    metadata |= describe_reading(index)
+    metadata |= describe_reading(index) | keep_origin(describe_fit(config, 0, 0.0), "budget")
     configs = _divide_size(config, spans, metadata)
     if restart and folder.is_dir():
         shutil.rmtree(folder)  # only once the clip has been read

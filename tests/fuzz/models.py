@@ -261,7 +261,7 @@ def compact_header_changed(data: bytes, random: Random) -> bytes:
 def _read_compact(path: Path) -> None:
     read_origin(path) if compact.is_compact(path) else load_compact(path)
     with warnings.catch_warnings():
-        warnings.filterwarnings("ignore", ".*(chunks (is|are)|a layer is) cut off or damaged")
+        warnings.filterwarnings("ignore", ".*(chunks (is|are)|that can be read, but) cut off or damaged")
         load_video_model(path) if compact.is_compact(path) else None
         if chance(path) % 4 == 0:
             load_compact(path, visible=(0.2, 0.3))

@@ -1,12 +1,14 @@
 """Fits in layers: clips taken apart, models of each object and of the whole background, and their files."""
 
+from pathlib import Path
+
 import cv2
 import numpy as np
 import pytest
 from commands import call
 from panned_clips import SIZE, disc_clip, panned, texture
 
-from foldgauss.io import load_video_model, read_video, save_compact, save_video_model, write_frames
+from foldgauss.io import load_video_model, read_metadata, read_video, save_compact, save_video_model, write_frames
 from foldgauss.io.edit_script import EditScriptError, parse_edit_script
 from foldgauss.io.media.masks import read_object_masks
 from foldgauss.io.models.model_file import ModelFileError
@@ -193,7 +195,9 @@ def test_a_part_of_a_file_has_the_background(fitted, tmp_path):
     assert data[:size] == alone.read_bytes()
     for damaged in (data[: size + 10], data[:size] + bytes(20), data[: size + 40] + b"#" + data[size + 41 :]):
         path.write_bytes(damaged)
-        with pytest.warns(UserWarning, match="a layer is cut off or damaged"):
+        with pytest.warns(
+            UserWarning, match="what follows layer 1 is no layer that can be read, but cut off or damaged"
+        ):
             found = load_video_model(path)
         assert isinstance(found, EditedVideo)
         assert [layer.name for layer in found.layers] == ["background"]
@@ -252,8 +256,10 @@ def test_a_stopped_fit_continues_in_its_layer(folders, monkeypatch, stop):
 
 
 def test_segments_have_layers(folders):
-    call(*FIT, "--segment-seconds", 0.2, "--frames", "0:8")
+    call(*FIT, "--segment-seconds", 0.2, "--frames", "0:8", "--size-mb", 0.08)
     video = load_video_model("a.fgz")
+    assert read_metadata("a.fgz")["budget"] == {"steps": 60, "size_mb": 0.08}  # of the whole, not of a segment
+    assert Path("a.fgz").stat().st_size <= 80_000
     assert [[layer.name for layer in one.model.layers] for one in video.segments] == 2 * [["object", "background"]]
     assert edit(video).select(layer="object").vanish().video().num_gaussians < video.num_gaussians
 

@@ -205,7 +205,8 @@ def load_compact_model(path: Path, data: bytes | None = None) -> VideoModel | Ed
         except ModelFileError:
             if not layers:
                 raise
-            warnings.warn(f"{str(path)!r}: a layer is cut off or damaged. Copy it again.", stacklevel=3)
+            told = f"what follows layer {len(layers)} is no layer that can be read, but cut off or damaged"
+            warnings.warn(f"{str(path)!r}: {told}. Copy it again.", stacklevel=3)
             break
         with np.errstate(over="ignore", invalid="ignore"):
             model = dequantize(quantized)
