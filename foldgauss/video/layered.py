@@ -36,18 +36,21 @@ def plan_layers(
 ) -> list[LayerPlan]:
     """The layers of a clip, from front to back: see `separate`.
 
-    Frame times are not learned, so that they are the same in all layers. `minutes` and `size_mb` are divided by the
-    areas of the layers, where a pixel of an object counts `OBJECT_SHARE`. A PSNR is that of the visible pixels: errors
+    Frame times are not learned, so that they are the same in all layers. `minutes` are divided by the roots of the areas
+    of the layers, since a step takes some time whatever the area, and `size_mb` by the areas, where a pixel of an object
+    counts `OBJECT_SHARE`. A PSNR is that of the visible pixels: errors
     are then the same in all layers, as with one λ. Without masks, the background is the only one.
     """
     parts, unknown = separate(frames, masks) if masks else ({BACKGROUND: frames}, 0.0)
     cuts = motion_finder(frames)().cuts
-    areas = [OBJECT_SHARE * mask.mean() for mask in masks.values()]
-    shares = np.array([*areas, 1.0]) / (sum(areas) + 1)
+    areas = np.array([mask.mean() for mask in masks.values()])
+    shares = {"minutes": [*np.sqrt(areas), 1.0], "size_mb": [*OBJECT_SHARE * areas, 1.0]}
     plans = []
-    for (name, own), share in zip(parts.items(), shares, strict=True):
+    for number, (name, own) in enumerate(parts.items()):
         changes: dict[str, float] = {"rates.frame_times": 0.0}
-        changes |= {key: share * getattr(config, key) for key in ("minutes", "size_mb") if getattr(config, key)}
+        for key, of in shares.items():
+            if getattr(config, key) is not None:
+                changes[key] = float(getattr(config, key) * of[number] / sum(of))
         if own.shape[3] == 4:
             changes["views.interpolation_fraction"] = 0.0
             if config.psnr is not None:

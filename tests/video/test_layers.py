@@ -8,10 +8,11 @@ import pytest
 from commands import call
 from panned_clips import SIZE, disc_clip, panned, texture
 
-from foldgauss.io import load_video_model, read_metadata, read_video, save_compact, save_video_model, write_frames
+from foldgauss.io import load_video_model, read_video, save_compact, save_video_model, write_frames
 from foldgauss.io.edit_script import EditScriptError, parse_edit_script
 from foldgauss.io.media.masks import read_object_masks
 from foldgauss.io.models.model_file import ModelFileError
+from foldgauss.io.models.video_model import read_metadata
 from foldgauss.jobs import runner
 from foldgauss.video import EditedVideo, FitConfig, edit, evaluate, psnr
 from foldgauss.video.layered import fit_layers, plan_layers

@@ -100,6 +100,7 @@ def initialize(
 ) -> FoldedSplats:
     """Initial splats for `frames`, uint8 (num_frames, height, width, 3), at `times` (default: evenly spaced).
 
+    With alpha, (..., 4), there are none where frames are transparent.
     Positions are drawn by image gradient within each frame, m_t is that frame's time, sizes follow from the local
     density of starts, colors from the pixel. With `motion`, folds follow the optical flow, and sigma_t is drawn as a
     fraction of the length of the track; without, folds are at rest and sigma_t is log-uniform. Where one of `paths`,
@@ -109,14 +110,20 @@ def initialize(
     rng = make_generator(Stream.INITIALIZATION, seed=seed)
     num_frames = len(frames)
     times = np.linspace(0, 1, num_frames) if times is None else np.asarray(times, np.float64)
-    density_of = lambda k: measure_detail(frames[k])  # noqa: E731
+    seen = frames[..., 3] > 0 if frames.shape[3] == 4 else None
+    frames = np.ascontiguousarray(frames[..., :3])  # as seen over black
+    density_of = lambda k: measure_detail(frames[k], None if seen is None else seen[k])  # noqa: E731
     make = lambda home, position, longer=1.0: make_splats(  # noqa: E731
         frames, home, position, times, degree, envelope, motion, rng, opacity, paths, longer
     )
     chance, lifetime = _try_starts(times, make, density_of, rng)
+    if seen is not None and seen.any():
+        chance *= seen.any((1, 2))
+        chance /= chance.sum()
     if callable(num_gaussians):
         num_gaussians = num_gaussians(lifetime)
-    longer = max(FEW_ALIVE * frames[..., 0].size / max(num_gaussians * lifetime, 1), 1.0)
+    area = frames[..., 0].size if seen is None else seen.sum()
+    longer = max(FEW_ALIVE * area / max(num_gaussians * lifetime, 1), 1.0)
     if num_gaussians < FEW_STARTS * num_frames:  # random frames would leave out whole intervals
         home = _draw(chance, (np.arange(num_gaussians) + rng.random()) / num_gaussians)
     else:
@@ -329,13 +336,17 @@ def _fit_tracks(
     return folds, wide
 
 
-def measure_detail(frame: np.ndarray) -> np.ndarray:
-    """Density of starts over the pixels of a frame (height, width), summing to 1: by gradient, and partly even."""
+def measure_detail(frame: np.ndarray, seen: np.ndarray | None = None) -> np.ndarray:
+    """Density of starts over the pixels of a frame (height, width), summing to 1: by gradient, and partly even.
+
+    `seen`: bool, the pixels where starts may be; all, if there is none of them.
+    """
     gray = cv2.cvtColor(frame, cv2.COLOR_RGB2GRAY).astype(np.float32) / 255
     slope = np.hypot(cv2.Sobel(gray, cv2.CV_32F, 1, 0), cv2.Sobel(gray, cv2.CV_32F, 0, 1)).astype(np.float64)
-    slope = cv2.GaussianBlur(slope, (0, 0), 1.0)
-    even = np.full(slope.shape, 1 / slope.size)
-    total = slope.sum()
+    slope, even = cv2.GaussianBlur(slope, (0, 0), 1.0), np.ones(slope.shape)
+    if seen is not None and seen.any():
+        slope, even = slope * seen, even * seen
+    even, total = even / even.sum(), slope.sum()
     return EVEN_FRACTION * even + (1 - EVEN_FRACTION) * (slope / total if total > 0 else even)
 
 

@@ -276,7 +276,7 @@ def start(
 ) -> FitState:
     """State before the first step; frame times start evenly in each shot."""
     find_motion = find_motion or motion_finder(frames)
-    has_alpha, frames = frames.shape[3] == 4, np.ascontiguousarray(frames[..., :3])  # as seen over black
+    has_alpha = frames.shape[3] == 4
     begun, num_frames = clock(), len(frames)
     motion = find_motion() if config.follows_motion else None
     cuts = cuts if cuts is not None else motion.cuts if motion is not None else []
