@@ -36,10 +36,10 @@ def plan_layers(
 ) -> list[LayerPlan]:
     """The layers of a clip, from front to back: see `separate`.
 
-    Frame times are not learned, so that they are the same in all layers. `minutes` are divided by the roots of the areas
-    of the layers, since a step takes some time whatever the area, and `size_mb` by the areas, where a pixel of an object
-    counts `OBJECT_SHARE`. A PSNR is that of the visible pixels: errors
-    are then the same in all layers, as with one λ. Without masks, the background is the only one.
+    Frame times are not learned, so that they are the same in all layers. `minutes` are divided by the roots of the
+    areas of the layers, since a step takes some time whatever the area, and `size_mb` by the areas, where a pixel of an
+    object counts `OBJECT_SHARE`. A PSNR is that of the visible pixels: errors are then the same in all layers, as with
+    one λ. Without masks, the background is the only one.
     """
     parts, unknown = separate(frames, masks) if masks else ({BACKGROUND: frames}, 0.0)
     cuts = motion_finder(frames)().cuts
