@@ -255,7 +255,7 @@ WRONG = [
     (f"{COMPRESS} --minutes 5", 2, "--minutes: expected none without the clip"),
     (f"{COMPRESS} nowhere.mp4", 2, "nowhere.mp4"),
     ("compress loop", 2, "got 'loop', which cannot be reached"),
-    ("compress edited.safetensors --out e.fgz", 2, "MODEL: expected a plain model, got one with edits"),
+    ("compress edited.safetensors --out e.fgz", 2, "MODEL: expected a plain model, got one with edits, or of layers"),
     *(
         (words, 2, "MODEL: expected a model of one piece, got one in segments. Extract one: foldgauss export")
         for words in ("compress segments.safetensors", "uncertainty segments.safetensors clip")

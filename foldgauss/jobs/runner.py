@@ -39,6 +39,8 @@ REPORT_SECONDS = 1.0
 WAIT_SECONDS = 60.0
 #: How many dB a model may be below the PSNR that was asked for without a warning.
 TOLERATED_DB = 0.05
+#: The fraction of what objects hide from which on it is told that no frame shows it.
+LEAST_TOLD = 0.005
 #: Number of clip shapes whose compiled programs are kept.
 MAX_SHAPES = 8
 
@@ -114,7 +116,7 @@ def run_fit(
     models, compact, notes, seconds, num_steps = {}, {}, [], 0.0, 0
     for number, plan in enumerate(_plan_layers(job, clip)):
         hidden = f"{plan.unknown:.0%} of what is behind objects is shown by no frame: texture from around it is fitted."
-        own = clip.notes * (not number) + (hidden,) * (plan.unknown > 0)
+        own = clip.notes * (not number) + (hidden,) * (plan.unknown >= LEAST_TOLD)
         notes += own
         part = dataclasses.replace(clip, frames=plan.frames, source=plan.name or clip.source, notes=own)
         checkpoint = Checkpoint(job.checkpoint_of(number), plan.config, fingerprint(part), on_checkpoint_error)
@@ -177,7 +179,7 @@ def _plan_layers(job: FitJob, clip: Clip) -> list[LayerPlan]:
             masks = {"object": find_moving_object(clip.frames)}
     else:
         begin = (job.metadata.get("frames") or job.frames or (0,))[0] or 0
-        found = read_object_masks(job.masks, begin, clip.num_frames, clip.size)
+        found = read_object_masks(job.masks, begin, clip.num_frames, clip.size, crop=job.size is not None)
         masks = {name: own for name, own in found.items() if own.any()}
     require(masks or is_part, "masks", expected="an object in these frames", got=f"none in {job.masks!r}")
     return plan_layers(clip.frames, masks, job.config)

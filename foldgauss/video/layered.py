@@ -19,6 +19,10 @@ from foldgauss.video.motion.optical_flow import motion_finder
 #: An object changes more from frame to frame than the background, whose motion is the camera's: so many times as many
 #: bytes for each of its pixels.
 OBJECT_SHARE = 3.0
+#: The least time for all objects, in units of that for the background.
+LEAST_SHARE = 0.25
+#: How many times as large squared errors of objects are as those of the background, in fits of equal quality.
+OBJECT_ERROR = 3.0
 
 
 class LayerPlan(NamedTuple):
@@ -38,13 +42,15 @@ def plan_layers(
 
     Frame times are not learned, so that they are the same in all layers. `minutes` are divided by the roots of the
     areas of the layers, since a step takes some time whatever the area, and `size_mb` by the areas, where a pixel of an
-    object counts `OBJECT_SHARE`. A PSNR is that of the visible pixels: errors are then the same in all layers, as with
-    one λ. Without masks, the background is the only one.
+    object counts `OBJECT_SHARE`. A PSNR is that of all pixels that are seen, where errors of objects are `OBJECT_ERROR`
+    times as large; that of an object's layer, most of which is empty, is higher. Without masks, the background is the
+    only one.
     """
     parts, unknown = separate(frames, masks) if masks else ({BACKGROUND: frames}, 0.0)
     cuts = motion_finder(frames)().cuts
     areas = np.array([mask.mean() for mask in masks.values()])
-    shares = {"minutes": [*np.sqrt(areas), 1.0], "size_mb": [*OBJECT_SHARE * areas, 1.0]}
+    least = LEAST_SHARE / max(len(areas), 1)
+    shares = {"minutes": [*np.maximum(np.sqrt(areas), least), 1.0], "size_mb": [*OBJECT_SHARE * areas, 1.0]}
     plans = []
     for number, (name, own) in enumerate(parts.items()):
         changes: dict[str, float] = {"rates.frame_times": 0.0}
@@ -53,8 +59,9 @@ def plan_layers(
                 changes[key] = float(getattr(config, key) * of[number] / sum(of))
         if own.shape[3] == 4:
             changes["views.interpolation_fraction"] = 0.0
-            if config.psnr is not None:
-                changes["psnr"] = min(config.psnr - 10 * math.log10((own[..., 3] > 0).mean()), 99.0)
+        if config.psnr is not None:
+            error = OBJECT_ERROR * areas[number] if own.shape[3] == 4 else 1.0
+            changes["psnr"] = min(config.psnr - 10 * math.log10(error / (1 + (OBJECT_ERROR - 1) * areas.sum())), 99.0)
         plans.append(LayerPlan(name, own, config.replace(**changes), cuts, unknown * (own.shape[3] == 3)))
     return plans
 

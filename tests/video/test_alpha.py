@@ -1,15 +1,19 @@
 """Frames with alpha: the fit learns alpha and not the background."""
 
 import dataclasses
+from collections import deque
 
 import numpy as np
 import pytest
 from clips import moving_blobs
 
-from foldgauss.video import FitConfig, evaluate, fit
+from foldgauss.video import FitConfig, evaluate, fit, fit_steps
+from foldgauss.video.fitting.loop import start
+from foldgauss.video.fitting.relocation import make_newborns
 from foldgauss.video.fitting.schedule import to_planes
 from foldgauss.video.models.background import check_background, composite, random_background
 from foldgauss.video.models.renderer import VideoRenderer
+from foldgauss.video.models.row_layout import columns
 
 CONFIG = FitConfig(num_gaussians=400, steps=250)
 WHITE, GREEN = (1.0, 1.0, 1.0), (0.0, 1.0, 0.0)
@@ -89,3 +93,20 @@ def test_without_a_background_images_have_alpha(fitted):
     sums = dataclasses.replace(model, compositing="sum")
     with pytest.raises(ValueError, match="background: expected black"):
         next(sums.frames(background=None))
+
+
+def test_gaussians_start_and_are_added_where_a_clip_is_not_transparent():
+    frames = np.zeros((6, 60, 90, 4), np.uint8)
+    frames[:4, 20:32, 30:45] = [120, 60, 30, 255]  # and nothing in the last two
+    frames[:4, 20:32:2, 30:45, :3] = [20, 90, 160]
+    config = FitConfig(num_gaussians=300, steps=200, quality=70.0, seed=1)
+    state = start(frames, config)
+    before = np.array(state.leaf("loc")) * 90 + [45, 30]
+    inside = (before > [29, 19]).all(1) & (before < [46, 33]).all(1)
+    assert inside.all()
+    ((state, _),) = deque(fit_steps(frames, config), maxlen=1)
+    new = make_newborns(200, state, frames, config, None)
+    at, size = columns(config.fold_degree)["loc"], columns(config.fold_degree)["log_scale"]
+    places = new[:, at] * 90 + [45, 30]
+    assert ((places > [29, 19]).all(1) & (places < [46, 33]).all(1)).all()
+    assert np.median(np.exp(new[:, size])) * 90 < 1.5  # pixels; as far apart as Gaussians are where there are any

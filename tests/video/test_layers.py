@@ -142,9 +142,12 @@ def test_budgets_are_divided(clip):
     assert sum(plan.config.minutes for plan in plans) == pytest.approx(2)
     assert sum(plan.config.size_mb for plan in plans) == pytest.approx(0.5)
     assert all(not plan.config.learns_frame_times for plan in plans)
-    disc, ground = plan_layers(frames, {"disc": masks}, FitConfig(psnr=30.0))
-    assert ground.config.psnr == 30
-    assert disc.config.psnr == pytest.approx(30 - 10 * np.log10((disc.frames[..., 3] > 0).mean()))
+    disc, ground = (
+        10 ** (-0.1 * one.config.psnr) for one in plan_layers(frames, {"disc": masks}, FitConfig(psnr=30.0))
+    )
+    area = masks.mean()
+    assert disc / area == pytest.approx(3 * ground)
+    assert disc + (1 - area) * ground == pytest.approx(1e-3)  # the errors of what is seen
 
 
 def test_layers_composited_are_the_clip(fitted, clip):
@@ -219,13 +222,15 @@ def folders(clip, tmp_path, monkeypatch):
 FIT = ("fit", "clip", "--masks", "masks", "--steps", 60, "--out", "a.fgz", "--quiet")
 
 
+@pytest.mark.filterwarnings("default:.*no shared paths")
 def test_the_command_fits_layers(folders, clip):
     told = "of what is behind objects is shown by no frame"
     call(*FIT[:-1], out=["object: 8 frames of 90x160 with alpha", "background: 8 frames"], err=["background: ", told])
     whole = (folders / "a.fgz").read_bytes()
     assert [layer.name for layer in load_video_model("a.fgz").layers] == ["object", "background"]
     assert not list(folders.glob("*.checkpoint"))
-    call("info", "a.fgz", out="layer 0")
+    call("info", "a.fgz", out="layer 0 (object): none")
+    call("export", "a.fgz", "--format", "ply", "--out", "a.ply", err="no shared paths")
     call("evaluate", "a.fgz", "clip")
     call(*FIT, "--overwrite")
     assert (folders / "a.fgz").read_bytes() == whole
@@ -291,7 +296,12 @@ def test_masks_of_the_whole_clip_are_cut(folders, clip):
     assert list(both) == ["object 1", "object 7"]
     assert (both["object 1"] == (labels == 1)).all()
     call("fit", "clip", "--masks", "two", "--frames", "0:4", "--steps", 5, "--out", "b.fgz", "--quiet")
-    call("fit", "clip", "--masks", "nothing", code=2, err="nothing")
+    call(
+        "fit", "clip", "--masks", "nothing", code=2, err="--masks: expected a folder, an image or a video, or 'moving'"
+    )
+    write_frames(folders / "wide", np.repeat(255 * np.uint8(masks[:, :45])[..., None], 3, -1))
+    call("fit", "clip", "--masks", "wide", code=2, err="masks: expected the aspect of the clip, 90x160")
+    call("fit", "clip", "--masks", "wide", "--size", "40x160", "--steps", 3, "--out", "c.fgz", "--quiet")
     call(
         "fit",
         "clip",

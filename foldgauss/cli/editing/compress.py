@@ -66,8 +66,8 @@ def compress_command(
         isinstance(model, VideoModel),
         "MODEL",
         expected="a plain model",
-        got="one with edits",
-        cure="Compress the model before it is edited, and edit that.",
+        got="one with edits, or of layers",
+        cure="Compress the model before it is edited, and edit that. Layers are compact where `fit` writes a .fgz.",
     )
     clip = None if video is None else read_fitted_clip(model, model_path, video, frames)
     require(

@@ -5,7 +5,7 @@ from typing import Annotated, Any
 
 import typer
 
-from foldgauss._runtime.checks import check_one_of, require
+from foldgauss._runtime.checks import ParameterError, check_one_of, require
 from foldgauss.cli.app.application import command, out
 from foldgauss.cli.app.help import complete_choice
 from foldgauss.cli.shared.arguments import ModelFile, Overwrite, Size, parse_size, parse_times
@@ -29,7 +29,9 @@ from foldgauss.io.models.video_model import (
     read_origin,
     save_video_model,
 )
+from foldgauss.video.editing.edited_video import EditedVideo
 from foldgauss.video.models.video_model import VideoModel
+from foldgauss.video.segmented.layering import flatten_video
 from foldgauss.video.segmented.segmented_video import SegmentedVideo
 
 _NAMES = {"model": "foldgauss", "ply": "VeGaS video", "ply3dgs": "3DGS scenes", "obj": "triangles"}
@@ -84,13 +86,11 @@ def export_command(
     suffix = {"model": MODEL_SUFFIX, "ply": ".ply"}.get(file_format, "")
     if file_format == "ply" and isinstance(model, SegmentedVideo):
         suffix = ""  # each segment becomes a file
-    require(
-        file_format != "ply" or isinstance(model, VideoModel | SegmentedVideo),
-        "MODEL",
-        expected="a plain model for ply",
-        got="one with edits",
-        cure="Its frames can be exported as ply3dgs or obj.",
-    )
+    if file_format == "ply" and isinstance(model, EditedVideo):
+        try:
+            model = flatten_video(model)
+        except ParameterError as error:
+            raise ParameterError("MODEL", error.problem) from error
     single = file_format == "ply3dgs" and chosen is not None and len(chosen) == 1
     if out_path is None:
         ending = ".3dgs.ply" if single else suffix or f"-{file_format.replace('ply3', '3')}"

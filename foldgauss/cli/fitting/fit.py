@@ -105,6 +105,12 @@ def fit(
     workers. Options for rare cases: docs/fit.md.
     """
     target, config = _choose_target(video, target, config)
+    require(
+        masks in (None, MOVING) or Path(masks).exists(),
+        "--masks",
+        expected=f"a folder, an image or a video, or {MOVING!r}",
+        got=f"{masks!r}, which is missing",
+    )
     job = FitJob(
         video.name,
         str(video),

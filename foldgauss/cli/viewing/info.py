@@ -113,7 +113,8 @@ def _describe_edits(model: EditedVideo) -> str:
         on = f" on {count:,} of {layer.num_gaussians:,} Gaussians" if edits else ""
         layers.append(f"{len(edits) or 'none'}{on}")
     if len(layers) > 1:
-        layers = [f"layer {number}: {text}" for number, text in enumerate(layers)]
+        names = [f"{number} ({layer.name})" if layer.name else number for number, layer in enumerate(model.layers)]
+        layers = [f"layer {name}: {text}" for name, text in zip(names, layers, strict=True)]
     return ", ".join(layers) + "; those baked into the parameters are not counted"
 
 

@@ -94,14 +94,14 @@ def read_masks(
 
 
 def read_object_masks(
-    path: PathLike, first: int, num_frames: int, size: Size
+    path: PathLike, first: int, num_frames: int, size: Size, *, crop: bool = True
 ) -> dict[str, Bool[np.ndarray, "num_frames height width"]]:
     """The masks of each object, by name, for `num_frames` frames of `size`, from frame `first` of the clip on.
 
     A folder of label images, one for each frame of the clip or of the part, or an image of one frame: objects are
     called "object", or "object 1", "object 2" by their labels; a video has one. Masks are cropped to the aspect of
-    `size` around the center, then resized. Those of some objects may be empty in a part. Raises as `read_masks`, and
-    ValueError for another number of masks, and where no object is in them.
+    `size` around the center, or refused unless `crop`, then resized. Those of some objects may be empty in a part.
+    Raises as `read_masks`, and ValueError for another number of masks, and where no object is in them.
     """
     path = check_path(path)
     check_input(path, "a folder, an image or a video")
@@ -119,6 +119,13 @@ def read_object_masks(
             "masks",
             expected=f"one for each of {num_frames} frames",
             got=f"{len(own)} in {str(path)!r}",
+        )
+        height, width = own.shape[1:]
+        require(
+            crop or abs(height * size[1] - width * size[0]) <= max(height, width, *size),
+            "masks",
+            expected=f"the aspect of the clip, {format_size(size)}",
+            got=format_size((height, width)),
         )
         own = np.uint8(own[:num_frames, *aspect_window(own.shape[1:], size)])
         masks[name] = np.stack([cv2.resize(mask, size[::-1], interpolation=cv2.INTER_NEAREST) > 0 for mask in own])

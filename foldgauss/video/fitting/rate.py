@@ -289,7 +289,8 @@ class RateControl(DensityControl):
             return 0
         gain = self._gain(state, action) * (2 if action.progress < _TRUSTED_FROM else 1)
         missing = config.psnr + _MARGIN_DB - self._psnr(self._model(state), self.sampled) - gain
-        needed = num * 2 ** min(max(missing, 0.0), 1.0)  # as if twice as many raised it by 1 dB
+        part = 1.0 if action.progress < _TRUSTED_FROM else self._adaptation(state, action)  # of those that converge
+        needed = num * 2 ** (part * min(max(missing, 0.0), 1.0))  # as if twice as many raised it by 1 dB
         most = 2 * START_PER_TIME * time_per_pixel(config, *shape) * math.prod(shape)
         return round(min(needed, most, most_gaussians(config))) - num
 

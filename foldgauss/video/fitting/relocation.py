@@ -142,6 +142,7 @@ def make_newborns(
     window, errors = find_windows(state.rows, spec), state.frame_errors.astype(float)
     spec, colors = dataclasses.replace(spec, paths=paths), np.ascontiguousarray(frames[..., :3])
     home = np.sort(rng.choice(len(frames), num, p=errors / errors.sum()))
+    seen = frames[..., 3] > 0 if frames.shape[3] == 4 else np.ones(frames.shape[:3], bool)
 
     def density_of(k: int) -> np.ndarray:
         # With alpha over a random color, always the same for the frame.
@@ -150,7 +151,7 @@ def make_newborns(
         leaves = done.mean, done.factor, done.opacity, done.color, background
         image = cpu.forward(*leaves, spec.size, compositing=config.compositing, options=config.options).image
         squares = ((image - to_planes(frames[k], background)) ** 2).sum(0)
-        smooth = cv2.GaussianBlur(squares.astype(np.float64), (0, 0), 1.0) + 1e-12
+        smooth = (cv2.GaussianBlur(squares.astype(np.float64), (0, 0), 1.0) + 1e-12) * np.maximum(seen[k], 1e-9)
         return smooth / smooth.sum()
 
     position, _ = draw_positions(home, density_of, rng)
@@ -160,7 +161,7 @@ def make_newborns(
     rows = pack(splats)
     alive = float(np.mean([((window[:, 0] < t) & (t < window[:, 1])).sum() for t in times]))  # in a frame
     size, at = frames.shape[1:3], columns(config.fold_degree)["log_scale"]
-    apart = math.sqrt(math.prod(size) / max(alive, 1.0)) / max(size)
+    apart = math.sqrt(math.prod(size) * max(seen.mean(), 1e-9) / max(alive, 1.0)) / max(size)
     larger = 0.0 if paths is None else rows[:, at] + np.log(max(size))  # by the path's zoom
     rows[:, at] = np.log(SMALLER * SCALE_FACTOR * apart) + larger
     return rows
