@@ -61,7 +61,8 @@ def plan_layers(
             changes["views.interpolation_fraction"] = 0.0
         if config.psnr is not None:
             error = OBJECT_ERROR * areas[number] if own.shape[3] == 4 else 1.0
-            changes["psnr"] = min(config.psnr - 10 * math.log10(error / (1 + (OBJECT_ERROR - 1) * areas.sum())), 99.0)
+            db = config.psnr - 10 * math.log10(error / (1 + (OBJECT_ERROR - 1) * areas.sum()))
+            changes["psnr"] = min(round(db, 2), 99.0)
         plans.append(LayerPlan(name, own, config.replace(**changes), cuts, unknown * (own.shape[3] == 3)))
     return plans
 

@@ -146,8 +146,8 @@ def test_budgets_are_divided(clip):
         10 ** (-0.1 * one.config.psnr) for one in plan_layers(frames, {"disc": masks}, FitConfig(psnr=30.0))
     )
     area = masks.mean()
-    assert disc / area == pytest.approx(3 * ground)
-    assert disc + (1 - area) * ground == pytest.approx(1e-3)  # the errors of what is seen
+    assert disc / area == pytest.approx(3 * ground, rel=0.01)
+    assert disc + (1 - area) * ground == pytest.approx(1e-3, rel=0.01)  # the errors of what is seen
 
 
 def test_layers_composited_are_the_clip(fitted, clip):
