@@ -362,7 +362,7 @@ GIVEN = {
     "README.md": ("holiday.mp4", "masks", "film.mp4", "holidays"),
     "docs/commands.md": ("holiday.mp4",),
     "docs/compress.md": ("holiday.mp4",),
-    "docs/editing.md": ("holiday.mp4", "holiday.safetensors", "edits.toml"),
+    "docs/editing.md": ("holiday.mp4", "holiday.safetensors", "edits.toml", "masks"),
     "docs/fit.md": ("holiday.mp4", "DAVIS", "folder/of/images"),
     "docs/format.md": ("holiday.mp4", "holiday.safetensors"),
     "docs/formats.md": ("holiday.safetensors", "point_cloud.ply"),
