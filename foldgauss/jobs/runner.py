@@ -39,7 +39,7 @@ REPORT_SECONDS = 1.0
 WAIT_SECONDS = 60.0
 #: How many dB a model may be below the PSNR that was asked for without a warning.
 TOLERATED_DB = 0.05
-#: The fraction of what objects hide from which on it is told that no frame shows it.
+#: A note reports the hidden background that no frame shows, if its fraction is at least this.
 LEAST_TOLD = 0.005
 #: Number of clip shapes whose compiled programs are kept.
 MAX_SHAPES = 8

@@ -16,12 +16,12 @@ from foldgauss.video.motion.background_plate import Frames
 from foldgauss.video.motion.layer_clips import BACKGROUND, separate
 from foldgauss.video.motion.optical_flow import motion_finder
 
-#: An object changes more from frame to frame than the background, whose motion is the camera's: so many times as many
-#: bytes for each of its pixels.
+#: Bytes for a pixel of an object, relative to a pixel of the background. Objects deform; the background moves with the
+#: camera.
 OBJECT_SHARE = 3.0
-#: The least time for all objects, in units of that for the background.
+#: The least time for all objects together, relative to the time for the background.
 LEAST_SHARE = 0.25
-#: How many times as large squared errors of objects are as those of the background, in fits of equal quality.
+#: The mean squared error in objects, relative to the background, in fits of a given PSNR.
 OBJECT_ERROR = 3.0
 
 
@@ -42,9 +42,9 @@ def plan_layers(
 
     Frame times are not learned, so that they are the same in all layers. `minutes` are divided by the roots of the
     areas of the layers, since a step takes some time whatever the area, and `size_mb` by the areas, where a pixel of an
-    object counts `OBJECT_SHARE`. A PSNR is that of all pixels that are seen, where errors of objects are `OBJECT_ERROR`
-    times as large; that of an object's layer, most of which is empty, is higher. Without masks, the background is the
-    only one.
+    object counts `OBJECT_SHARE`. `psnr` is the goal of the composited video. The goals of the layers follow from it:
+    the squared error is `OBJECT_ERROR` times as large in objects, and transparent pixels have none. Without masks, the
+    background is the only layer.
     """
     parts, unknown = separate(frames, masks) if masks else ({BACKGROUND: frames}, 0.0)
     cuts = motion_finder(frames)().cuts

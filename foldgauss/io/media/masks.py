@@ -99,8 +99,9 @@ def read_object_masks(
     """The masks of each object, by name, for `num_frames` frames of `size`, from frame `first` of the clip on.
 
     A folder of label images, one for each frame of the clip or of the part, or an image of one frame: objects are
-    called "object", or "object 1", "object 2" by their labels; a video has one. Masks are cropped to the aspect of
-    `size` around the center, or refused unless `crop`, then resized. Those of some objects may be empty in a part.
+    called "object", or "object 1", "object 2" by their labels; a video has one. Masks of another aspect than `size` are
+    cropped around the center, or refused if `crop` is False. Then they are resized. An object may have no pixels in a
+    part.
     Raises as `read_masks`, and ValueError for another number of masks, and where no object is in them.
     """
     path = check_path(path)

@@ -99,8 +99,8 @@ _TRUSTED_FROM = 0.42
 _ADDED_UNTIL = 0.55
 #: Mean squared errors of a frame below this, in [0, 1], count as 0: its PSNR is at its maximum.
 _PERFECT = 1e-10
-#: A frame counts with at most so many dB more than the PSNR that is asked for: nearly perfect ones, such as black ones,
-#: do not make up for others.
+#: The PSNR of a frame is clipped at the goal plus this, in dB. Nearly perfect frames, such as black ones, then do not
+#: compensate for poor ones.
 _MOST_OVER_DB = 6.0
 #: The gain of a model that was finished already, at most.
 _GAIN_OF_GIVEN = 0.2

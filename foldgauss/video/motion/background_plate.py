@@ -42,7 +42,8 @@ UNCOVERED = 250 / 255
 MUCH_UNKNOWN = 0.1
 #: Texture is made anew where more than this fraction of what is unknown in a frame was in no other frame.
 NEW_TEXTURE = 0.1
-#: It is found in images whose longer side is at most so many pixels: the time rises with the fourth power.
+#: Texture is made in a window reduced to this longer side, in pixels. At half of the size it takes a fifth to a tenth
+#: of the time.
 TEXTURE_SIDE = 240
 #: What an object covers is replaced with this margin, a fraction of the longer side,
 MARGIN = 0.012
