@@ -240,10 +240,11 @@ def describe_fit(config: FitConfig, steps: int, seconds: float) -> dict[str, Any
 
 
 def missed_psnr(config: FitConfig, psnr: float, cure: str = "--minutes or --steps, or more --gaussians") -> list[str]:
-    """A warning that the model of a fit has a lower PSNR than asked for, unless a quality limits it, too."""
-    if config.psnr is None or config.quality is not None or psnr >= config.psnr - TOLERATED_DB:
+    """A warning that the model of a fit has a lower PSNR than asked for."""
+    if config.psnr is None or psnr >= config.psnr - TOLERATED_DB:
         return []
     larger = "" if config.size_mb is None else ", or a larger --size-mb"
+    larger += "" if config.quality is None else ", or a higher --quality"
     return [f"--psnr: expected {config.psnr:g} dB, got {psnr:.2f}. Give more {cure}{larger}."]
 
 

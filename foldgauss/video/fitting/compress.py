@@ -73,6 +73,7 @@ def compress(
     budget = planned_steps(dataclasses.replace(config, minutes=None), len(frames))
     state = start_from(model, config, steps or math.ceil((1 - COMPRESSION_START) * budget), COMPRESSION_START)
     config = dataclasses.replace(config, steps=state.plan if steps else None)
+    RateControl(frames, config).check_size(state)
     return fit(frames, config, fps=model.fps, state=state, observers=observers)
 
 

@@ -159,7 +159,10 @@ def fit_steps(
     engine = choose_engine(frames, config)
     _warm_up(frames, config, engine)
     find_motion = motion_finder(frames, motion)
-    state = start(frames, config, find_motion, clock, cuts) if state is None else state
+    if state is None:
+        state = start(frames, config, find_motion, clock, cuts)
+        if config.is_compact:
+            RateControl(frames, config).check_size(state)
     require(
         len(state.frame_errors) == len(frames),
         "frames",
@@ -168,7 +171,7 @@ def fit_steps(
     )
     planner, time_left = StepPlanner(config), TimeLeft(state, config)
     guard = Guard(state, config, steps_per_pass(config, len(frames)), alpha=has_alpha)
-    controls = [*_make_controls(frames, config, state, find_motion), *controls]
+    controls = [*_make_controls(frames, config, find_motion), *controls]
     stopped_by = find_limit(state, config)
     if stopped_by:  # a resumed state that needs no more steps
         yield state, _make_info(state, config, time_left, StepResult(math.nan, 0), stopped_by)
@@ -209,15 +212,12 @@ def fit_steps(
         yield state, _make_info(state, config, time_left, result, stopped_by)
 
 
-def _make_controls(
-    frames: np.ndarray, config: FitConfig, state: FitState, find_motion: Callable[[], Motion]
-) -> list[DensityControl]:
+def _make_controls(frames: np.ndarray, config: FitConfig, find_motion: Callable[[], Motion]) -> list[DensityControl]:
     """What the settings ask for."""
     controls: list[DensityControl] = []
     followed = find_motion if config.follows_motion else lambda: None
     if config.is_compact:
         controls.append(RateControl(frames, config, followed))
-        controls[0].check_size(state)
     if relocates(config):
         controls.append(Relocation(frames, config, followed))
     if config.strategy.growth is not None:

@@ -71,6 +71,8 @@ BYTES_PER_DEGREE = 80
 BYTES_PER_CHUNK = 110
 #: Bytes of the header for the length of a stream.
 BYTES_PER_STREAM = 8
+#: Bytes of a learned frame time, at most in usual clips; evenly spaced ones take hardly any.
+BYTES_PER_TIME = 1.6
 #: How finely the coarseness is searched for a size, which changes by more until the end of the fit: 1% of the bytes.
 _TOLERANCE_OF_SIZE = 0.02
 #: By how many dB dropping has to worsen the images at once for what remains of it to be measured.
@@ -186,6 +188,8 @@ class RateControl(DensityControl):
         exact, one = compute_columns(self._model(state)), np.arange(state.num_gaussians) == 0
         rules = {name: Rule(0.0, COARSEST) for name in column_names(self.config.fold_degree) if not is_integral(name)}
         least = count_bytes(quantize(select_rows(exact, one), np.zeros(1, np.int32), rules)) / 1e6
+        if self.config.learns_frame_times:
+            least += BYTES_PER_TIME * len(self.frames) / 1e6
         require(least <= size, "size_mb", expected=f"at least {least:.4f} for this clip", got=size)
 
     def is_due(self, state: FitState) -> bool:
@@ -284,14 +288,17 @@ class RateControl(DensityControl):
     def _count_missing(self, state: FitState, action: Action) -> int:
         """How many Gaussians a PSNR needs besides those that there are; 0 if the rest of the fit may reach it alone."""
         config, num, shape = self.config, state.num_gaussians, self.frames.shape[:3]
-        is_only_goal = config.psnr is not None and (config.quality, config.size_mb) == (None, None)
-        if not is_only_goal or action.progress > _ADDED_UNTIL or not errors_are_known(state, config):
+        if config.psnr is None or action.progress > _ADDED_UNTIL or not errors_are_known(state, config):
             return 0
         gain = self._gain(state, action) * (2 if action.progress < _TRUSTED_FROM else 1)
         missing = config.psnr + _MARGIN_DB - self._psnr(self._model(state), self.sampled) - gain
         part = 1.0 if action.progress < _TRUSTED_FROM else self._adaptation(state, action)  # of those that converge
         needed = num * 2 ** (part * min(max(missing, 0.0), 1.0))  # as if twice as many raised it by 1 dB
         most = 2 * START_PER_TIME * time_per_pixel(config, *shape) * math.prod(shape)
+        if config.size_mb is not None:
+            most = min(most, self._count_held(action))
+        if config.quality is not None:
+            most = min(most, self._usual_cost(state, action) / (bit_price(coarseness_of(config.quality)) * USUAL_BITS))
         return round(min(needed, most, most_gaussians(config))) - num
 
     def _drop(self, state: FitState, action: Action) -> None:
@@ -350,11 +357,9 @@ class RateControl(DensityControl):
 
     def _solve_size(self, state: FitState, measured: Worth | Quantizer, action: Action) -> float:
         """The coarseness for the largest file: by the number of Gaussians that it holds, and for rounding by coding."""
-        room = 1e6 * self.config.size_mb
-        if action.what == "drop":  # at first more than it holds
-            num = 8 * max(room - HEADER_BYTES, 0.0) / USUAL_BITS / math.sqrt(action.extent)
-            return max(measured.coarseness_for(num, action.extent), FINEST)
-        streams = max(room - HEADER_BYTES, 64.0)
+        if action.what == "drop":
+            return max(measured.coarseness_for(self._count_held(action), action.extent), FINEST)
+        streams = max(1e6 * self.config.size_mb - HEADER_BYTES, 64.0)
 
         @functools.cache
         def excess(coarseness: float) -> float:
@@ -366,6 +371,11 @@ class RateControl(DensityControl):
         if excess(COARSEST) > 0:
             return COARSEST
         return FINEST if excess(FINEST) <= 0 else brentq(excess, FINEST, COARSEST, xtol=_TOLERANCE_OF_SIZE)
+
+    def _count_held(self, action: Action) -> float:
+        """The number of Gaussians that are kept for the largest file: at first more than it holds."""
+        room = max(1e6 * self.config.size_mb - HEADER_BYTES, 0.0)
+        return 8 * room / USUAL_BITS / math.sqrt(action.extent)
 
     def _solve_psnr(self, state: FitState, measured: Worth | Quantizer, action: Action) -> float:
         """The coarseness for the PSNR that is asked for.
@@ -395,7 +405,8 @@ class RateControl(DensityControl):
         if not drops:
             low = max(state.coarseness - _MOST_FINER, FINEST)
             high = state.coarseness + (now + gain - aim) / _DB_PER_UNIT if state.coarseness else COARSEST
-            return coarsest(_MOST_ROUNDED_DB, low, high)
+            found = coarsest(_MOST_ROUNDED_DB, low, high)
+            return found if found > low else coarsest(_MOST_ROUNDED_DB, FINEST, low)
         most = _most_dropped_db(state, self._psnr(self._model(state), self.sampled))
         sure_gain = gain if state.rules else _SURE * gain
         sure = coarsest(min(2 * (now + sure_gain - aim), most), _LEAST_DROPPED, COARSEST)
@@ -417,20 +428,24 @@ class RateControl(DensityControl):
         return dequantize(quantize(select_rows(compute_columns(model), kept), classes, rules))
 
     def _usual_coarseness(self, state: FitState, worth: Worth, action: Action) -> float:
-        """The coarseness at which the bits of what is kept cost a usual multiple of the error that is asked for.
-
-        Where the error falls as a power of the bits, D ~ R^-b, the best file has lambda R = b D.
-        """
+        """The coarseness at which the bits of what is kept have the usual cost."""
         grid = np.arange(FINEST, COARSEST, _TOLERANCE)
         kept = [worth.are_worth(coarseness, action.extent).sum() for coarseness in grid]
         costs = [bit_price(coarseness) * USUAL_BITS * num for coarseness, num in zip(grid, kept, strict=True)]
+        limit = self._usual_cost(state, action)
+        return float(grid[np.argmax(np.minimum(costs, limit))])  # the first of enough, or the most
+
+    def _usual_cost(self, state: FitState, action: Action) -> float:
+        """The cost of the bits of a usual file of the PSNR that is asked for: a multiple of its error.
+
+        Where the error falls as a power of the bits, D ~ R^-b, the best file has lambda R = b D.
+        """
         part = _USUAL_COST * min(self._count_passes(state.plan) / _USUAL_PASSES, 1.0)
         # All frames are assumed to differ by as many dB from now.
         least = max(_PERFECT, _error_at(self.config.psnr + _MOST_OVER_DB))
         typical = np.mean(-10 * np.log10(np.maximum(self._seen_errors(state), least)))
         missing = self.config.psnr - typical + running_psnr(state)
-        limit = part * action.extent**_COST_POWER * 255**2 * _error_at(missing) * self.frames[..., :3].size
-        return float(grid[np.argmax(np.minimum(costs, limit))])  # the first of enough, or the most
+        return part * action.extent**_COST_POWER * 255**2 * _error_at(missing) * self.frames[..., :3].size
 
     def _seen_errors(self, state: FitState) -> Float[np.ndarray, " seen"]:
         """The mean squared errors of the frames that were seen. If none was, the running error."""
