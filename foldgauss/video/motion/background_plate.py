@@ -88,6 +88,13 @@ class Alignment:
         """The first frame of each shot and the one after its last."""
         return list(itertools.pairwise([*self.starts, len(self.images)]))
 
+    def of_shot(self, first: int, stop: int) -> "Alignment":
+        """The alignment of the frames of a shot alone."""
+        between = slice(first, stop - 1)
+        return Alignment(
+            self.images[first:stop], self.there[between], self.back[between], self.matrices[first:stop], (0,)
+        )
+
     def between(self, frame: int, other: int) -> Float[np.ndarray, "3 3"]:
         """The map of points of the background in one frame to another of the same shot."""
         return self.matrices[other] @ np.linalg.inv(self.matrices[frame])

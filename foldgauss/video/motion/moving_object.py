@@ -6,13 +6,15 @@ the flow, and pixels near them are assigned by their color.
 """
 
 import warnings
+from collections.abc import Callable, Iterable
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
 import scipy
 from jaxtyping import Bool, Float32, Int32, UInt8
 
-from foldgauss._runtime.checks import ParameterError, invalid
+from foldgauss._runtime.checks import ParameterError, invalid, require
 from foldgauss._runtime.threads import run_tasks
 from foldgauss.video.motion.background_plate import (
     Alignment,
@@ -94,6 +96,8 @@ VOTE_ODDS = 3.0
 BEYOND = 4
 #: A motion cannot be told from a camera's in fewer frames.
 LEAST_FRAMES = 3
+#: A click is at most this fraction of the longer side beside the object.
+CLICK_REACH = 0.03
 #: The cure of errors of selections, which can be made otherwise.
 SELECT_OTHERWISE = "Select by a mask, a box or a click."
 
@@ -102,12 +106,19 @@ class NothingMoves(ParameterError):
     """No object moves on its own, or none that can be told from the background."""
 
 
-def find_moving_object(frames: Frames, *, shadow: bool = False, alignment: Alignment | None = None) -> Masks:
+def find_moving_object(
+    frames: Frames,
+    *,
+    at: tuple[int, float, float] | None = None,
+    shadow: bool = False,
+    alignment: Alignment | None = None,
+) -> Masks:
     """Where the largest object is that moves on its own, in each frame: bool (num_frames, height, width).
 
     `frames` are uint8 (num_frames, height, width, 3), in which the background fills most of the image and moves as a
     plane does, about: a camera that turns, zooms, or passes a distant scene. Each shot has an object of its own, and
-    objects that touch count as one. Masks are empty where it is hidden. `shadow`: with the shadow that it casts.
+    objects that touch count as one. Masks are empty where it is hidden. `at` = (frame, x, y), in pixels, chooses the
+    object there instead of the largest one, in its shot. `shadow`: with the shadow that it casts.
     `alignment` aligns the frames. By default it is estimated. A shot without an object gives a
     warning.
 
@@ -121,14 +132,22 @@ def find_moving_object(frames: Frames, *, shadow: bool = False, alignment: Align
     alignment = Alignment.from_frames(frames) if alignment is None else alignment
     small = resize_frames(frames)
     height, width = frames.shape[1:3]
+    inside = at is None or (0 <= at[0] < len(frames) and 0 <= at[1] < width and 0 <= at[2] < height)
+    expected = f"(frame, x, y) below ({len(frames)}, {width}, {height})"
+    require(inside, "at", expected=expected, got=at)
     masks = np.zeros((len(frames), height, width), bool)
-    for shot in alignment.shots:
-        for k, mask in zip(range(*shot), _find_in_shot(small, alignment, shot, shadow), strict=False):
+    for first, stop in alignment.shots:
+        if at is not None and not first <= at[0] < stop:
+            continue
+        place = None if at is None else (at[0] - first, *(int(one * small.shape[2] / width) for one in at[1:]))
+        found = _find_in_shot(small[first:stop], alignment.of_shot(first, stop), shadow, place)
+        for k, mask in zip(range(first, stop), found, strict=False):
             masks[k] = cv2.resize(mask.astype(np.float32), (width, height), interpolation=cv2.INTER_LINEAR) > 0.5
     if not masks.any():
-        raise nothing_moves("an object that moves against the background", "none")
+        where = "" if at is None else " at {1:g},{2:g} in frame {0}".format(*at)
+        raise nothing_moves(f"an object that moves against the background{where}", "none")
     missing = [f"{first}:{stop}" for first, stop in alignment.shots if not masks[first:stop].any()]
-    if missing:
+    if missing and at is None:
         warnings.warn(f"No moving object was found in the shots of frames {', '.join(missing)}.", stacklevel=2)
     return masks
 
@@ -138,38 +157,27 @@ def nothing_moves(expected: str, got: object, cure: str = SELECT_OTHERWISE) -> N
     return invalid("moving", expected=expected, got=got, cure=cure, kind=NothingMoves)
 
 
-def _find_in_shot(frames: Frames, alignment: Alignment, shot: tuple[int, int], shadow: bool) -> Masks | list:
-    """The masks of one shot at the size of the alignment's images; none if nothing moves."""
-    first, stop = shot
-    num = stop - first
-    if num < LEAST_FRAMES:
+def _find_in_shot(
+    frames: Frames, alignment: Alignment, shadow: bool, place: tuple[int, int, int] | None = None
+) -> Masks | list:
+    """The masks of a shot, all of the alignment, at the size of its images; none if nothing moves."""
+    if len(frames) < LEAST_FRAMES:
         return []
-    moved = np.stack(_map(lambda k: _measure_motion(alignment, first + k, shot), num))
-    moved = _vote(moved, alignment, first, MOTION_VOTE)
-    covered = np.zeros(frames.shape[:3], bool)
-    covered[first:stop] = [dilate(one > CERTAINLY, 9) for one in moved]
-    slight, strong = (np.empty(moved.shape, bool) for _ in range(2))
-
-    def compare(k: int) -> Float32[np.ndarray, "rows columns"]:
-        plate, count = render_plate(frames, covered, alignment, first + k, shot)
-        slight[k], strong[k] = (_find_shadow(frames[first + k], plate, level) for level in (SLIGHT, STRONG))
-        different = np.where(count < 2, moved[k], _measure_difference(frames[first + k], plate, count >= 2))
-        return moved[k] ** MOTION_POWER * different ** (1 - MOTION_POWER)
-
-    evidence = np.stack(_map(compare, num))
+    cues = measure_cues(frames, alignment)
+    evidence = cues.moved**MOTION_POWER * cues.different ** (1 - MOTION_POWER)
     relative = [np.minimum(1, one / np.clip(np.percentile(one, TOP), FAINTEST, 1)) for one in evidence]
-    pieces = _map(lambda k: _cut_out(frames[first + k], relative[k], slight[k]), num)
-    masks = _track_best(pieces, relative, alignment, first)
+    pieces = run_all(lambda k: cut_out(frames[k], relative[k], cues.slight[k]), len(frames))
+    masks = _track_best(pieces, relative, alignment, place)
     if masks is None or max(one[mask].mean() for one, mask in zip(evidence, masks, strict=True) if mask.any()) < (
         LEAST_EVIDENCE
     ):
         return []
     if not shadow:
-        masks = np.stack([_clean(_cut_shadow(mask, dark)) for mask, dark in zip(masks, strong, strict=True)])
-    return _assign_by_color(frames[first:stop], _vote(masks.astype(np.float32), alignment, first, MASK_VOTE))
+        masks = np.stack([_clean(_cut_shadow(mask, dark)) for mask, dark in zip(masks, cues.strong, strict=True)])
+    return _assign_by_color(frames, _vote(masks.astype(np.float32), alignment, MASK_VOTE))
 
 
-def _map(function, num: int) -> list:
+def run_all(function: Callable[[int], Any], num: int) -> list:
     """`function(k)` for all k < num, by several threads."""
     results = [None] * num
 
@@ -183,7 +191,30 @@ def _map(function, num: int) -> list:
 # ------------------------------------------------------------------------------------------------------- evidence
 
 
-def _measure_motion(alignment: Alignment, k: int, shot: tuple[int, int]) -> Float32[np.ndarray, "rows columns"]:
+class Cues(NamedTuple):
+    """What tells an object of a shot from the background, of each pixel; the first two in [0, 1]."""
+
+    moved: Float32[np.ndarray, "frames rows columns"]  #: how certain it is that it moves on its own
+    different: Float32[np.ndarray, "frames rows columns"]  #: and differs from the background; else as `moved`
+    slight: Masks  #: whether it is darker than the background, as a slight shadow,
+    strong: Masks  #: and a strong one
+
+
+def measure_cues(frames: Frames, alignment: Alignment) -> Cues:
+    """The cues of the frames of a shot, all of the alignment."""
+    moved = np.stack(run_all(lambda k: _measure_motion(alignment, k), len(frames)))
+    moved, shot = _vote(moved, alignment, MOTION_VOTE), (0, len(frames))
+    covered = np.stack([dilate(one > CERTAINLY, 9) for one in moved])
+
+    def compare(k: int) -> tuple[np.ndarray, ...]:
+        plate, count = render_plate(frames, covered, alignment, k, shot)
+        different = np.where(count < 2, moved[k], _measure_difference(frames[k], plate, count >= 2))
+        return different, *(_find_shadow(frames[k], plate, level) for level in (SLIGHT, STRONG))
+
+    return Cues(moved, *map(np.stack, zip(*run_all(compare, len(frames)), strict=True)))
+
+
+def _measure_motion(alignment: Alignment, k: int) -> Float32[np.ndarray, "rows columns"]:
     """How certain it is that each pixel moves against the background, in [0, 1]."""
     image = alignment.images[k]
     size, ones = image.shape[::-1], np.ones_like(image)
@@ -191,7 +222,7 @@ def _measure_motion(alignment: Alignment, k: int, shot: tuple[int, int]) -> Floa
     for gap in GAPS:
         lengths = []
         for j in (k - gap, k + gap):
-            if not shot[0] <= j < shot[1]:
+            if not 0 <= j < len(alignment.images):
                 continue
             matrix = alignment.between(k, j)
             inside = cv2.erode(warp_by(ones, matrix, size, cv2.BORDER_CONSTANT), np.ones((5, 5))) > 0
@@ -244,7 +275,7 @@ def _find_shadow(image, plate, level: float) -> Bool[np.ndarray, "rows columns"]
 # -------------------------------------------------------------------------------------------------- masks of a frame
 
 
-def _cut_out(image, evidence, shadow: Bool[np.ndarray, "rows columns"]) -> Int32[np.ndarray, "rows columns"]:
+def cut_out(image, evidence, shadow: Bool[np.ndarray, "rows columns"]) -> Int32[np.ndarray, "rows columns"]:
     """Labels of the pieces that GrabCut finds, from 1; 0 elsewhere."""
     near = np.ones((3, 3))
     labels = np.full(evidence.shape, cv2.GC_BGD, np.uint8)
@@ -281,23 +312,23 @@ def _cut_shadow(mask, dark: Bool[np.ndarray, "rows columns"]) -> Bool[np.ndarray
 # ------------------------------------------------------------------------------------------------------ through time
 
 
-def _vote(values: Float32[np.ndarray, "frames rows columns"], alignment: Alignment, first: int, rate: float):
+def _vote(values: Float32[np.ndarray, "frames rows columns"], alignment: Alignment, rate: float):
     """The mean of each pixel's values along the flow, both ways, those nearer in time with more weight."""
     total, weights = values.copy(), np.ones_like(values)
     for step in (1, -1):
         order = range(len(values))[::step]
         carried, weight = values[order[0]], np.ones_like(values[0])
         for k in order[1:]:
-            ahead, back = alignment.flow(first + k, first + k - step)
-            certain = rate * _agreement(ahead, back)
-            carried, weight = (_pull(one, ahead) * certain for one in (carried, weight))
+            ahead, back = alignment.flow(k, k - step)
+            certain = rate * measure_agreement(ahead, back)
+            carried, weight = (pull(one, ahead) * certain for one in (carried, weight))
             total[k] += carried
             weights[k] += weight
             carried, weight = carried + values[k], weight + 1
     return total / weights
 
 
-def _agreement(there, back) -> Float32[np.ndarray, "rows columns"]:
+def measure_agreement(there, back) -> Float32[np.ndarray, "rows columns"]:
     """1 where the flow back leads home again, to 0 where it misses by more than `VOTE_MISS` pixels, or out of sight."""
     rows, columns = there.shape[:2]
     target = pixel_grid(rows, columns) + there
@@ -306,31 +337,45 @@ def _agreement(there, back) -> Float32[np.ndarray, "rows columns"]:
     return inside * np.exp(-(miss**2).sum(-1) / VOTE_MISS**2)
 
 
-def _pull(image: Float32[np.ndarray, "rows columns"], flow) -> Float32[np.ndarray, "rows columns"]:
+def pull(image: Float32[np.ndarray, "rows columns"], flow) -> Float32[np.ndarray, "rows columns"]:
     """The image of the frame that the flow leads to, seen from here; 0 outside."""
     return cv2.remap(image, pixel_grid(*image.shape) + flow, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT)
 
 
 def _assign_by_color(frames: Frames, votes: Float32[np.ndarray, "frames rows columns"]) -> Masks:
     """Masks of the pixels whose votes and colors are rather those of the object than of its surroundings."""
-    inside, outside = [], []  # bins of the colors of each frame
-    for image, vote in zip(frames, votes, strict=True):
-        bins, mask = _quantize(image), vote > 0.5
-        outward, inward = (cv2.distanceTransform(np.uint8(one), cv2.DIST_L2, 3) for one in (~mask, mask))
-        inside.append(bins[inward > 1])
-        outside.append(bins[mask.any() & (outward > 2) & (outward < SURROUNDINGS)])
+    judge = judge_colors(frames, votes > 0.5, range(len(frames)))
 
     def assign(k: int) -> Bool[np.ndarray, "rows columns"]:
-        window = slice(max(k - COLOR_REACH, 0), k + COLOR_REACH + 1)
-        own, other = (_count(np.concatenate(one[window])) for one in (inside, outside))
-        color = np.float32(COLOR_WEIGHT * (own - other) / (own + other))[_quantize(frames[k])]
         least = scipy.special.expit(-VOTE_ODDS)
-        odds = color + scipy.special.logit(np.clip(votes[k], least, 1 - least))
+        odds = judge(k) + scipy.special.logit(np.clip(votes[k], least, 1 - least))
         odds[~dilate(votes[k] > least, 2 * BEYOND + 1)] = -np.inf
         certain = cv2.ximgproc.guidedFilter(frames[k], np.float32(scipy.special.expit(odds)), 4, 1e-4 * 255**2)
         return _clean(certain > 0.5)
 
-    return np.stack(_map(assign, len(frames)))
+    return np.stack(run_all(assign, len(frames)))
+
+
+def judge_colors(
+    frames: Frames, masks: Masks, known: Iterable[int], reach: int = COLOR_REACH
+) -> Callable[[int], Float32[np.ndarray, "rows columns"]]:
+    """A function of a frame: how much the color of each pixel speaks for the object, as log odds.
+
+    Colors are counted in the `known` frames up to `reach` away: in the masks, and in what surrounds them.
+    """
+    inside, outside, known = {}, {}, np.array(list(known))
+    for k in known:
+        bins, mask = _quantize(frames[k]), masks[k]
+        outward, inward = (cv2.distanceTransform(np.uint8(one), cv2.DIST_L2, 3) for one in (~mask, mask))
+        inside[k] = bins[inward > 1]
+        outside[k] = bins[mask.any() & (outward > 2) & (outward < SURROUNDINGS)]
+
+    def judge(k: int) -> Float32[np.ndarray, "rows columns"]:
+        near = known[np.abs(known - k) <= reach]
+        own, other = (_count(np.concatenate([one[j] for j in near])) for one in (inside, outside))
+        return np.float32(COLOR_WEIGHT * (own - other) / (own + other))[_quantize(frames[k])]
+
+    return judge
 
 
 def _quantize(image: UInt8[np.ndarray, "rows columns 3"]) -> Int32[np.ndarray, "rows columns"]:
@@ -345,8 +390,14 @@ def _count(bins: Int32[np.ndarray, " pixels"]) -> np.ndarray:
     return scipy.ndimage.gaussian_filter(counts.reshape((BINS,) * 3), 1.0, truncate=3).ravel() + 1e-6
 
 
-def _track_best(pieces, evidence, alignment: Alignment, first: int) -> Masks | None:
+def _track_best(pieces, evidence, alignment: Alignment, place: tuple[int, int, int] | None) -> Masks | None:
     """The object whose track has most evidence; tracks begin at the best piece of every `SEED_SPACING`-th frame."""
+    if place is not None:
+        k, x, y = place
+        near = scipy.ndimage.distance_transform_edt(pieces[k] == 0, return_distances=False, return_indices=True)
+        row, column = near[:, y, x]
+        is_near = pieces[k].any() and np.hypot(row - y, column - x) <= CLICK_REACH * max(pieces[k].shape)
+        return track(pieces, pieces[k] == pieces[k][row, column], k, alignment) if is_near else None
     best, best_score = None, 0.0
     for k in range(min(2, len(pieces) - 1), len(pieces), SEED_SPACING):
         scores = np.bincount(pieces[k].ravel(), evidence[k].ravel())
@@ -354,14 +405,14 @@ def _track_best(pieces, evidence, alignment: Alignment, first: int) -> Masks | N
         seed = pieces[k] == scores.argmax()
         if not scores.any() or (best is not None and (best[k] & seed).sum() > INSIDE * seed.sum()):
             continue
-        masks = _track(pieces, seed, k, alignment, first)
+        masks = track(pieces, seed, k, alignment)
         score = sum(float(one[mask].sum()) for one, mask in zip(evidence, masks, strict=True))
         if score > best_score:
             best, best_score = masks, score
     return best
 
 
-def _track(pieces: list, seed: Bool[np.ndarray, "rows columns"], start: int, alignment: Alignment, first: int) -> Masks:
+def track(pieces: list, seed: Bool[np.ndarray, "rows columns"], start: int, alignment: Alignment) -> Masks:
     """The pieces of the object `seed` of frame `start` in all frames; while it is lost, it goes on at its speed."""
     masks = np.zeros((len(pieces), *seed.shape), bool)
     masks[start] = seed
@@ -369,10 +420,10 @@ def _track(pieces: list, seed: Bool[np.ndarray, "rows columns"], start: int, ali
     for step in (1, -1):
         last, missed, area, speed = seed, 0, float(seed.sum()), np.zeros(2)
         for k in range(start + step, len(pieces) if step > 0 else -1, step):
-            there, back = alignment.flow(first + k - step, first + k)
+            there, back = alignment.flow(k - step, k)
             if missed == 0:
                 speed = 0.8 * speed + 0.2 * np.median(there[last], axis=0)
-                expected = _pull(last.astype(np.float32), back) > 0.5
+                expected = pull(last.astype(np.float32), back) > 0.5
             else:
                 expected = scipy.ndimage.shift(last, speed[::-1], order=0)
             found = _choose_pieces(pieces[k], expected, min(1 + SEARCH * missed, farthest))
