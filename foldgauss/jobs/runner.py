@@ -179,19 +179,18 @@ def _plan_layers(job: FitJob, clip: Clip, first: int) -> tuple[list[LayerPlan], 
         got=repr(clip.source),
         cure="Its alpha cuts out the object.",
     )
-    alignment, masks, notes = Alignment.from_frames(clip.frames), {}, []
+    masks, notes = {}, []
+    if job.masks != MOVING:
+        read = read_object_masks(job.masks, first, clip.num_frames, clip.size, crop=job.size is not None)
+        masks = {name: own for name, own in read.items() if own.any()}
+    alignment = Alignment.from_frames(clip.frames)
     if job.masks == MOVING:
         with suppress(NothingMoves):
             found = find_moving_object(clip.frames, alignment=alignment)
             # They are found on small images: some pixels of the object are beside them.
             masks, covered = {"object": cover(found, BAND)}, found.mean((1, 2))[found.any((1, 2))]
             area = f"{covered.min():.1%} to {covered.max():.1%} of the image, in {len(covered)} of {len(found)} frames"
-            notes.append(
-                f"what moves covers {area}. Parts that stand still stay in the background: masks can hold them."
-            )
-    else:
-        read = read_object_masks(job.masks, first, clip.num_frames, clip.size, crop=job.size is not None)
-        masks = {name: own for name, own in read.items() if own.any()}
+            notes.append(f"what moves covers {area}. Parts that stand still are not found: masks may have them.")
     require(
         masks or job.index is not None,  # in a part there may be no object
         "masks",

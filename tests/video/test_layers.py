@@ -235,7 +235,7 @@ def test_the_command_fits_layers(folders, clip):
     call("evaluate", "a.fgz", "clip")
     call(*FIT, "--overwrite")
     assert (folders / "a.fgz").read_bytes() == whole
-    found = r"object: what moves covers \d.\d% to \d.\d% of the image, in 8 of 8 frames. Parts that stand still stay"
+    found = r"object: what moves covers \d.\d% to \d.\d% of the image, in 8 of 8 frames. Parts that stand still"
     told = call(*FIT[:2], "--masks", "moving", *FIT[4:], "--overwrite").err
     assert re.search(found, " ".join(told.split()))
     assert len(load_video_model("a.fgz").layers) == 2
@@ -272,7 +272,7 @@ def test_layers_are_rendered_alone(fitted, tmp_path, monkeypatch):
     call("render", "a.safetensors", "--layer", "background", out="a.background.mp4: 8 frames at 20 frames per second")
     call("render", "a.safetensors", "--layer", "background", "--format", "png")
     empty = np.stack(list(results["background"].model.frames()))
-    np.testing.assert_array_equal(read_video("a.background-frames").frames, empty)
+    np.testing.assert_array_equal(read_video("a-background-frames").frames, empty)
     call("render", "a.safetensors", "--layer", "background", "--layer", "disc", "--out", "both")
     np.testing.assert_array_equal(read_video("both").frames, np.stack(list(video.frames())))
     told = "--layer: expected 'background' or 'disc', got 'disk'."

@@ -208,7 +208,7 @@ def _stabilize(model: Video, camera: str, smoothing: float, border: str) -> Vide
 def _name_output(model_path: Path, timeline: Timeline, image_format: str | None, kind: str) -> Path:
     """The default name of the video, image or folder; never that of the clip, which may be in this folder."""
     if image_format is not None:
-        return name_after(model_path, f"{kind}-frames")
+        return Path(str(name_after(model_path, f"{kind}-frames")).replace(".", "-"))  # a folder has no extension
     suffix = IMAGE_SUFFIX if timeline.is_single else VIDEO_SUFFIXES[0]
     path = name_after(model_path, f"{kind}{suffix}")
     clip = read_origin(model_path).get("clip", path.name)  # if unknown, it may have that name
