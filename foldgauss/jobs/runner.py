@@ -42,7 +42,7 @@ REPORT_SECONDS = 1.0
 WAIT_SECONDS = 60.0
 #: How many dB a model may be below the PSNR that was asked for without a warning.
 TOLERATED_DB = 0.05
-#: A note reports the hidden background that no frame shows, if its fraction is at least this.
+#: A warning tells of the hidden background that no frame shows, if its fraction is at least this.
 LEAST_TOLD = 0.005
 #: Number of clip shapes whose compiled programs are kept.
 MAX_SHAPES = 8
@@ -118,12 +118,9 @@ def run_fit(
     about = describe_source(clip, job.config.seed) | span | describe_reading(clip) | job.metadata
     if is_model(job.clip):
         about |= place_in_clip(job.clip, clip, job.frames)
-    plans, found = _plan_layers(job, clip, (about["frames"] or (0,))[0] or 0)
-    models, compact, notes, seconds, num_steps = {}, {}, [], 0.0, 0
-    for number, plan in enumerate(plans):
-        hidden = f"{plan.unknown:.0%} of what is behind objects is shown by no frame: texture from around it is fitted."
-        own = (*clip.notes, *found) * (not number) + (hidden,) * (plan.unknown >= LEAST_TOLD)
-        notes += own
+    models, compact, seconds, num_steps = {}, {}, 0.0, 0
+    for number, plan in enumerate(_plan_layers(job, clip, (about["frames"] or (0,))[0] or 0)):
+        own = clip.notes * (not number)
         part = dataclasses.replace(clip, frames=plan.frames, source=plan.name or clip.source, notes=own)
         checkpoint = Checkpoint(job.checkpoint_of(number), plan.config, fingerprint(part), on_checkpoint_error)
         state = checkpoint.load() if resume else None
@@ -163,15 +160,18 @@ def run_fit(
         "file_bytes": os.path.getsize(job.target),
         "file_digest": file_digest(job.target),
         "peak_bytes": peak_bytes(),
-        "notes": notes,
+        "notes": list(clip.notes),
         "warnings": missed_psnr(job.config, scores.mean_psnr),
     }
 
 
-def _plan_layers(job: FitJob, clip: Clip, first: int) -> tuple[list[LayerPlan], list[str]]:
-    """The layers of the clip, or the clip as the only one, and notes; `first`: the number that its first frame has."""
+def _plan_layers(job: FitJob, clip: Clip, first: int) -> list[LayerPlan]:
+    """The layers of the clip, or the clip as the only one; `first`: the number that its first frame has.
+
+    Warnings tell of what moves, of shots, and of how much of the background no frame shows.
+    """
     if job.masks is None:
-        return [LayerPlan("", clip.frames, job.config)], []
+        return [LayerPlan("", clip.frames, job.config)]
     require(
         not clip.has_alpha,
         "masks",
@@ -179,7 +179,7 @@ def _plan_layers(job: FitJob, clip: Clip, first: int) -> tuple[list[LayerPlan], 
         got=repr(clip.source),
         cure="Its alpha cuts out the object.",
     )
-    masks, notes = {}, []
+    masks = {}
     if job.masks != MOVING:
         read = read_object_masks(job.masks, first, clip.num_frames, clip.size, crop=job.size is not None)
         masks = {name: own for name, own in read.items() if own.any()}
@@ -190,7 +190,10 @@ def _plan_layers(job: FitJob, clip: Clip, first: int) -> tuple[list[LayerPlan], 
             # They are found on small images: some pixels of the object are beside them.
             masks, covered = {"object": cover(found, BAND)}, found.mean((1, 2))[found.any((1, 2))]
             area = f"{covered.min():.1%} to {covered.max():.1%} of the image, in {len(covered)} of {len(found)} frames"
-            notes.append(f"what moves covers {area}. Parts that stand still are not found: masks may have them.")
+            warnings.warn(
+                f"What moves covers {area}. Parts that stand still are not found: masks may have them.",
+                stacklevel=2,
+            )
     require(
         masks or job.index is not None,  # in a part there may be no object
         "masks",
@@ -200,8 +203,17 @@ def _plan_layers(job: FitJob, clip: Clip, first: int) -> tuple[list[LayerPlan], 
     )
     if len(alignment.starts) > 1:
         starts = ", ".join(map(str, alignment.starts))
-        notes.append(f"what is behind objects is found in each shot on its own; shots begin at frames {starts}.")
-    return plan_layers(clip.frames, masks, job.config, alignment), notes
+        warnings.warn(
+            f"What is behind objects is found in each shot on its own. Shots begin at frames {starts}.",
+            stacklevel=2,
+        )
+    plans = plan_layers(clip.frames, masks, job.config, alignment)
+    if plans[-1].unknown >= LEAST_TOLD:
+        warnings.warn(
+            f"{plans[-1].unknown:.0%} of what is behind objects is shown by no frame: texture replaces it.",
+            stacklevel=2,
+        )
+    return plans
 
 
 def _write_model(job: FitJob, save: Callable[[Path], Path]) -> None:

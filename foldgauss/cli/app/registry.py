@@ -21,7 +21,7 @@ COMMANDS: Mapping[str, Command] = MappingProxyType(
         ),
         "view": Command("viewing.view", "Play and edit a model in the browser, or write the page that does."),
         "render": Command(
-            "viewing.render", "Render a model as a video: also between its frames, stabilized, or without an object."
+            "viewing.render", "Render a model as a video: also between its frames, stabilized, or some of its layers."
         ),
         "evaluate": Command("viewing.evaluate", "Compare a model with its clip: PSNR and SSIM of every frame."),
         "info": Command("viewing.info", "Show what a model file contains."),
