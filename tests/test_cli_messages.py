@@ -10,7 +10,7 @@ from commands import call, full_disk, run
 from foldgauss._runtime.checks import invalid
 from foldgauss._runtime.settings import setting_of
 from foldgauss.cli.app.application import load_commands
-from foldgauss.io import load_video_model, write_frames, write_image, write_video
+from foldgauss.io import load_video_model, write_frames, write_video
 from foldgauss.io.datasets import waves
 from foldgauss.io.models.video_model import read_metadata
 from foldgauss.video import FitConfig
@@ -76,7 +76,7 @@ def test_a_page_is_told_of_where_there_is_no_terminal(model, tmp_path, monkeypat
     call("view", model, "--out", tmp_path / "new" / "p.html", err="Writing the page")
 
 
-#: Commands that write after long work, by what they write; CLIP, MODEL, MASK and SCRIPT are inputs, OUT is the output.
+#: Commands that write after long work, by what they write; CLIP, MODEL and SCRIPT are inputs, OUT is the output.
 WRITING = {
     "m.safetensors": ["fit", "CLIP", *FIT, "--out", "OUT"],
     "joined.safetensors": ["fit", "CLIP", *FIT, "--segment-seconds", "0.3", "--out", "OUT"],
@@ -84,8 +84,6 @@ WRITING = {
     "frames": ["render", "MODEL", "--out", "OUT"],
     "one.png": ["render", "MODEL", "--frame", "1", "--out", "OUT"],
     "stable.webp": ["render", "MODEL", "--stabilize", "smooth", "--out", "OUT"],
-    "plate.mp4": ["render", "MODEL", "--plate", "--masks", "MASK", "--out", "OUT"],
-    "masks": ["render", "MODEL", "--plate", "--masks", "MASK", "--out", "plate.mp4", "--save-masks", "OUT"],
     "edited.safetensors": ["edit", "MODEL", "SCRIPT", "--out", "OUT"],
     "edited.mp4": ["edit", "MODEL", "SCRIPT", "--out", "OUT"],
     "m.fgz": ["compress", "MODEL", "--out", "OUT"],
@@ -108,14 +106,12 @@ def full(tmp_path, monkeypatch):
         yield tmp_path / "full"
 
 
-@pytest.mark.filterwarnings("default:.*of the removed area is shown by no frame")
 @pytest.mark.parametrize("name", WRITING)
 def test_a_result_for_a_full_disk_is_kept(name, work, full):
-    mask, script = full.parent / "mask.png", full.parent / "s.toml"
-    write_image(mask, np.full((4, 4, 3), 255, np.uint8))
+    script = full.parent / "s.toml"
     script.write_text('[[edits]]\ndo = "recolor"\ngain = 0.5\n')
     model = work / "a" / "b" / "m.safetensors"
-    inputs = {"CLIP": work / "clip.mp4", "MODEL": model, "MASK": mask, "SCRIPT": script, "OUT": full / name}
+    inputs = {"CLIP": work / "clip.mp4", "MODEL": model, "SCRIPT": script, "OUT": full / name}
     last = call(*(inputs.get(word, word) for word in WRITING[name]), code=1).err.strip().splitlines()[-1]
     (kept,) = full.parent.glob(f"temporary/*/{name}")
     assert last.startswith("error: ")

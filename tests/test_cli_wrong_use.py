@@ -12,7 +12,7 @@ from commands import call, write_tone
 from soft_models import soft_model, soft_segments
 from tiny_clips import model_of_12, write_both
 
-from foldgauss.io import load_video_model, save_video_model, write_image, write_video
+from foldgauss.io import load_video_model, save_video_model, write_video
 from foldgauss.video import edit
 
 
@@ -62,7 +62,6 @@ def inputs(tmp_path_factory):
     write_pictures(folder / "alpha", *[np.full((40, 64, 4), 100, np.uint8)] * 3)
     write_pictures(folder / "three", *[gray + 255] * 3)
     write_pictures(folder / "empty", gray)
-    write_image(folder / "mask.png", gray + 255)
     write_tone(folder / "tone.wav", 1.0)
     (folder / "loop").symlink_to("loop")
     os.mkfifo(folder / "pipe.png")
@@ -71,7 +70,7 @@ def inputs(tmp_path_factory):
 
 FIT, RENDER = "fit clip.mp4 --out out.safetensors", "render model.safetensors --out"
 EDIT, VIEW = "edit model.safetensors dark.toml --out", "view model.safetensors --out"
-STABLE, PLATE = "render model.safetensors --stabilize smooth", "render --plate model.safetensors"
+STABLE = "render model.safetensors --stabilize smooth"
 SMALL, COMPRESS = "fit clip.mp4 --gaussians 400 --steps 30 --out out.fgz", "compress model.safetensors"
 PLY, SCENES = "export model.safetensors --format ply", "export model.safetensors --format ply3dgs"
 TRADEOFF, TIMES = "tradeoff clip.mp4 --out r --steps 12", "uncertainty model.safetensors clip --out"
@@ -81,9 +80,8 @@ WRONG = [
         (f"{words} --overwrite", 2, r"Inputs are never replaced\.")
         for words in (
             f"{RENDER} in.mp4 --sound in.mp4",
-            f"{PLATE} --sound in.mp4 --out in.mp4",
-            f"{PLATE} --masks in.mp4 --out in.mp4",
-            f"{PLATE} --masks in/0.png --out out.mp4 --save-masks in",
+            "fit clip.mp4 --masks in --out in",
+            "fit clip.mp4 --masks in.fgz --out in.fgz",
             "edit model.safetensors inputs.toml --sound in.mp4 --out in.mp4",
             "edit model.safetensors inputs.toml --out in",
             "edit model.safetensors inputs.toml --out in.safetensors",
@@ -108,7 +106,7 @@ WRONG = [
             "evaluate model.safetensors pipe.png",
             "fit pipe.png",
             "edit model.safetensors pipe.png",
-            f"{PLATE} --masks pipe.png",
+            "fit clip.mp4 --masks pipe.png",
             "import pipe.png",
         )
     ),
@@ -132,6 +130,13 @@ WRONG = [
     *((f"{FIT} --frames {frames}", 2, "frames: expected") for frames in ("98:99", "4:2")),
     *((f"{FIT} --size {size}", 2, "--size: expected HxW") for size in ("0x10", "48")),
     (f"{FIT} --size 100000x100000", 2, "GiB"),
+    (f"{FIT} --masks three", 2, "masks: expected one for each of 12 frames, got 3 in"),
+    (f"{FIT} --masks empty", 2, "masks: expected an object in them, got none in"),
+    ("fit two.safetensors --masks moving", 2, "frames: expected uint8 .* of 3 or more frames"),
+    ("fit other.safetensors", 1, "other.safetensors"),
+    ("fit short.safetensors", 1, "short.safetensors"),
+    ("fit model.safetensors --frames 12:", 2, "frames: expected A:B within 0:12"),
+    ("fit model.safetensors --segment-seconds 1", 2, "--segment-seconds: expected a clip for segments, got the model"),
     (f"{FIT} --degree 99", 2, "degree"),
     (f"{FIT} --preset best", 2, "--preset: expected one of.*'paper'"),
     (f"{FIT} --max-gaussians 0", 2, "--max-gaussians"),
@@ -186,43 +191,29 @@ WRONG = [
         for words in (f"{RENDER} x.mp4", "evaluate model.safetensors clip")
         for option in ("alpha-cutoff", "support-radius", "transmittance-stop")
     ),
-    # render --stabilize, render --plate
+    # render --stabilize
     (f"{STABLE} --border blur", 2, "--border: expected one of 'crop', 'fill', 'keep', got 'blur'"),
     ("render model.safetensors --stabilize no", 2, "--stabilize: expected one of 'smooth', 'fixed', got 'no'"),
     (f"{STABLE} --smoothing 0", 2, "--smoothing: expected seconds > 0, got 0.0"),
     ("render model.safetensors --stabilize fixed --smoothing 1", 2, "--stabilize fixed: expected no --smoothing, got"),
-    (f"{STABLE} --masks x.png", 2, "--masks: expected --plate too, got --masks alone"),
-    (f"{STABLE} --plate", 2, "--plate: expected no --stabilize, got both"),
+    (f"{STABLE} --layer object", 2, "--layer: expected a file with layers, as fit --masks writes it, got 'object'"),
     (f"{STABLE} --crf 99", 2, "--crf: expected"),
     (f"{STABLE} --background none", 2, "--out: expected RGB for h264 in .mp4"),
     (f"{STABLE} --background none --out x.gif", 2, "--background: expected a color for .gif, got none"),
     (f"{STABLE} --fps 60 --out x.gif", 2, "--out: expected at most 50 frames per second in it, got 60 for x.gif"),
     (f"{STABLE} --out x.png", 2, "--out: expected one image for a .png"),
     (f"{STABLE} --size 0x3", 2, "--size: expected HxW"),
-    ("render --plate two.safetensors --out images", 2, "MODEL: expected at least 3 frames, got 2. Fit more frames"),
-    (f"{PLATE} --masks three", 2, "--masks: expected one mask, or one for each of 12 frames, got 3 masks"),
-    (f"{PLATE} --masks empty/0.png", 2, "--masks: expected masks that are not empty"),
-    (f"{PLATE} --out x.png", 2, "--out: expected"),
-    (f"{PLATE} --size 0x3", 2, "--size: expected HxW"),
-    (f"{PLATE} --save-masks x.png", 2, "--save-masks: expected a folder, without extension, got x.png"),
-    (f"{PLATE} --codec divx", 2, "--codec: expected"),
-    (f"{PLATE} --crf 99", 2, r"--crf: expected a whole number from 0 to 51 for h264, got 99\."),
-    (f"{PLATE} --crf 20 --out x.gif", 2, r"--crf: expected a video file for it, got 'x.gif'\."),
-    (f"{PLATE} --codec h264 --out images", 2, r"--codec: expected a video file for it, got 'images'\."),
-    (f"{PLATE} --sound none.wav", 2, "--sound: expected a file, got 'none.wav', which is missing"),
-    (f"{PLATE} --codec av1", 2, "--out: expected at least 64x64 for av1"),
-    (f"{PLATE} --speed 2", 2, "--plate: expected no --speed, got both"),
-    (f"{PLATE} --background none", 2, "--plate: expected no --background none, got both"),
-    (f"{PLATE} --out x --save-masks ./x", 2, r"--save-masks: expected another folder than --out, got x\."),
     *(
-        (f"{PLATE} {options} --overwrite", 1, "expected an empty folder or one of numbered frames, got 'mine' with 'n")
-        for options in ("--save-masks mine", "--save-masks masks --out mine")
+        (f"{RENDER} {words} --overwrite", 1, f"expected {told}")
+        for words, told in (
+            ("mine", "an empty folder or one of numbered frames, got 'mine' with 'notes.txt'"),
+            ("file", "a folder for frames, got the file 'file'"),
+        )
     ),
-    (f"{PLATE} --out file --overwrite", 1, "expected a folder for frames, got the file 'file'"),
-    *(
-        (f"{words} --out x.gif", 2, "--out: expected at most 50 frames per second in it, got 60 for")
-        for words in ("render fast.safetensors --plate --masks mask.png", "edit fast.safetensors dark.toml")
-    ),
+    (f"{RENDER} x.mp4 --codec divx", 2, "--codec: expected"),
+    (f"{RENDER} x.mp4 --codec av1", 2, "--out: expected at least 64x64 for av1"),
+    (f"{RENDER} images --codec h264", 2, r"--codec: expected a video file for it, got 'images'\."),
+    ("edit fast.safetensors dark.toml --out x.gif", 2, "--out: expected at most 50 frames per second in it, got 60"),
     # edit
     ("edit model.safetensors none.toml --out o.safetensors", 2, "none.toml"),
     ("edit none.safetensors dark.toml --out o.safetensors", 2, "none.safetensors"),
@@ -314,7 +305,7 @@ WRONG = [
     ("uncertainty own.safetensors clip --out o --frames 0:5", 2, "Give all of them"),
     ("uncertainty none clip --out o", 2, "missing"),
     ("uncertainty edited.safetensors clip --out o", 2, "an edited one"),
-    ("uncertainty one.safetensors mask.png --out o", 2, "at least 3 frames"),
+    ("uncertainty one.safetensors empty/0.png --out o", 2, "at least 3 frames"),
 ]  # fmt: skip
 
 

@@ -53,12 +53,12 @@ _UNREADABLE = (OSError, ValueError, KeyError, TypeError, RecursionError)
 class FitJob:
     """A fit of a clip, or of a span of one, with all that it depends on; small, and the same on every machine.
 
-    `clip` and `target` are paths that every worker can open; `size` is the (height, width) of the frames, or None;
-    `frames` the range (first, stop) of the clip, or None. With `index`, the file of a `FrameIndex`, frames are found by
-    seeking, and counted from the first one of the index. `fps` replaces the clip's frame rate. `source` identifies the
-    clip: results of another source are not reused. `masks` is the path of the masks of objects that get layers of their
-    own, or `MOVING` for the object that moves. `metadata` is added to the metadata of the model file. Checkpoint
-    and record are in `folder`, by default beside the model.
+    `clip`, which may be a model file, whose frames are rendered, and `target` are paths that every worker can open;
+    `size` is the (height, width) of the frames, or None; `frames` the range (first, stop) of the clip, or None. With
+    `index`, the file of a `FrameIndex`, frames are found by seeking, and counted from the first one of the index. `fps`
+    replaces the clip's frame rate. `source` identifies the clip: results of another source are not reused. `masks` is
+    the path of the masks of objects that get layers of their own, or `MOVING` for the object that moves. `metadata` is
+    added to the metadata of the model file. Checkpoint and record are in `folder`, by default beside the model.
     """
 
     name: str

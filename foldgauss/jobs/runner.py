@@ -19,16 +19,19 @@ import numpy as np
 
 from foldgauss import __version__
 from foldgauss._runtime.checks import require
-from foldgauss.io import Clip, FrameIndex, read_indexed, read_video, save_video_model
+from foldgauss.io import Clip, FrameIndex, read_indexed, save_video_model
 from foldgauss.io._atomic import OutputError, atomic_path, lock_output, write_or_keep
 from foldgauss.io.media.masks import read_object_masks
 from foldgauss.io.models.checkpoint import is_known_good, load_checkpoint, save_checkpoint
 from foldgauss.io.models.compact import COMPACT_SUFFIX, leave_room, save_compact
+from foldgauss.io.models.rendered_clip import is_model, place_in_clip, read_clip_or_model
 from foldgauss.io.provenance import describe_reading, describe_source, fingerprint
 from foldgauss.jobs.job import MOVING, FitJob, file_digest, limit_range, read_record
 from foldgauss.video import Evaluation, FitConfig, FitDiverged, FitState, VideoModel, evaluate
 from foldgauss.video.fitting.loop import FitInfo, finish, fit_steps
 from foldgauss.video.layered import LayerPlan, plan_layers, stack
+from foldgauss.video.motion.background_plate import Alignment, cover
+from foldgauss.video.motion.layer_clips import BAND
 from foldgauss.video.motion.moving_object import NothingMoves, find_moving_object
 
 #: Seconds between two checkpoints of a running fit.
@@ -39,7 +42,7 @@ REPORT_SECONDS = 1.0
 WAIT_SECONDS = 60.0
 #: How many dB a model may be below the PSNR that was asked for without a warning.
 TOLERATED_DB = 0.05
-#: A note reports the hidden background that no frame shows, if its fraction is at least this.
+#: A warning tells of the hidden background that no frame shows, if its fraction is at least this.
 LEAST_TOLD = 0.005
 #: Number of clip shapes whose compiled programs are kept.
 MAX_SHAPES = 8
@@ -106,18 +109,18 @@ def run_fit(
         cure="Give a quality, a size or a PSNR.",
     )
     if job.index is None:
-        clip = read_video(job.clip, frames=job.frames, size=job.size)
+        clip = read_clip_or_model(job.clip, frames=job.frames, size=job.size)
     else:
         clip = read_indexed(FrameIndex.load(job.index), *job.frames, size=job.size)
         clip = dataclasses.replace(clip, fps=job.fps or clip.fps)
     _limit_compiled(clip.frames.shape)
     span = {"frames": limit_range(job.frames, clip.num_declared)}
     about = describe_source(clip, job.config.seed) | span | describe_reading(clip) | job.metadata
-    models, compact, notes, seconds, num_steps = {}, {}, [], 0.0, 0
-    for number, plan in enumerate(_plan_layers(job, clip)):
-        hidden = f"{plan.unknown:.0%} of what is behind objects is shown by no frame: texture from around it is fitted."
-        own = clip.notes * (not number) + (hidden,) * (plan.unknown >= LEAST_TOLD)
-        notes += own
+    if is_model(job.clip):
+        about |= place_in_clip(job.clip, clip, job.frames)
+    models, compact, seconds, num_steps = {}, {}, 0.0, 0
+    for number, plan in enumerate(_plan_layers(job, clip, (about["frames"] or (0,))[0] or 0)):
+        own = clip.notes * (not number)
         part = dataclasses.replace(clip, frames=plan.frames, source=plan.name or clip.source, notes=own)
         checkpoint = Checkpoint(job.checkpoint_of(number), plan.config, fingerprint(part), on_checkpoint_error)
         state = checkpoint.load() if resume else None
@@ -157,13 +160,16 @@ def run_fit(
         "file_bytes": os.path.getsize(job.target),
         "file_digest": file_digest(job.target),
         "peak_bytes": peak_bytes(),
-        "notes": notes,
+        "notes": list(clip.notes),
         "warnings": missed_psnr(job.config, scores.mean_psnr),
     }
 
 
-def _plan_layers(job: FitJob, clip: Clip) -> list[LayerPlan]:
-    """The layers of the clip, or the clip as the only one."""
+def _plan_layers(job: FitJob, clip: Clip, first: int) -> list[LayerPlan]:
+    """The layers of the clip, or the clip as the only one; `first`: the number that its first frame has.
+
+    Warnings tell of what moves, of shots, and of how much of the background no frame shows.
+    """
     if job.masks is None:
         return [LayerPlan("", clip.frames, job.config)]
     require(
@@ -173,16 +179,41 @@ def _plan_layers(job: FitJob, clip: Clip) -> list[LayerPlan]:
         got=repr(clip.source),
         cure="Its alpha cuts out the object.",
     )
-    is_part, masks = job.index is not None, {}  # in a part there may be no object
+    masks = {}
+    if job.masks != MOVING:
+        read = read_object_masks(job.masks, first, clip.num_frames, clip.size, crop=job.size is not None)
+        masks = {name: own for name, own in read.items() if own.any()}
+    alignment = Alignment.from_frames(clip.frames)
     if job.masks == MOVING:
-        with suppress(NothingMoves) if is_part else nullcontext():
-            masks = {"object": find_moving_object(clip.frames)}
-    else:
-        begin = (job.metadata.get("frames") or job.frames or (0,))[0] or 0
-        found = read_object_masks(job.masks, begin, clip.num_frames, clip.size, crop=job.size is not None)
-        masks = {name: own for name, own in found.items() if own.any()}
-    require(masks or is_part, "masks", expected="an object in these frames", got=f"none in {job.masks!r}")
-    return plan_layers(clip.frames, masks, job.config)
+        with suppress(NothingMoves):
+            found = find_moving_object(clip.frames, alignment=alignment)
+            # They are found on small images: some pixels of the object are beside them.
+            masks, covered = {"object": cover(found, BAND)}, found.mean((1, 2))[found.any((1, 2))]
+            area = f"{covered.min():.1%} to {covered.max():.1%} of the image, in {len(covered)} of {len(found)} frames"
+            warnings.warn(
+                f"What moves covers {area}. Parts that stand still are not found: masks may have them.",
+                stacklevel=2,
+            )
+    require(
+        masks or job.index is not None,  # in a part there may be no object
+        "masks",
+        expected="an object in these frames",
+        got="none that moves" if job.masks == MOVING else f"none in {job.masks!r}",
+        cure="Give masks of the object." if job.masks == MOVING else "",
+    )
+    if len(alignment.starts) > 1:
+        starts = ", ".join(map(str, alignment.starts))
+        warnings.warn(
+            f"What is behind objects is found in each shot on its own. Shots begin at frames {starts}.",
+            stacklevel=2,
+        )
+    plans = plan_layers(clip.frames, masks, job.config, alignment)
+    if plans[-1].unknown >= LEAST_TOLD:
+        warnings.warn(
+            f"{plans[-1].unknown:.0%} of what is behind objects is shown by no frame: texture replaces it.",
+            stacklevel=2,
+        )
+    return plans
 
 
 def _write_model(job: FitJob, save: Callable[[Path], Path]) -> None:

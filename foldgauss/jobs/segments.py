@@ -17,6 +17,7 @@ from foldgauss._runtime.checks import is_integer, is_within, require
 from foldgauss._runtime.settings import check_unchanged, flatten
 from foldgauss.io import FrameIndex, index_video, join_segments, read_indexed
 from foldgauss.io._atomic import OutputError, atomic_path
+from foldgauss.io.models.rendered_clip import is_model
 from foldgauss.io.models.video_model import MODEL_SUFFIX, keep_origin, load_video_model, read_metadata
 from foldgauss.io.provenance import describe_reading
 from foldgauss.jobs.job import FitJob, file_digest, limit_range, stamp_clip
@@ -143,6 +144,13 @@ def plan_long_fit(
     Example: `plan_long_fit("long.mp4", "long.safetensors").jobs`, for `run_here` or `run_on`.
     """
     config = FitConfig() if config is None else config
+    require(
+        not is_model(clip),
+        "segment_seconds",
+        expected="a clip for segments",
+        got=f"the model {str(clip)!r}",
+        cure="Fit it in one piece, or render it first: foldgauss render.",
+    )
     require(
         is_within(segment_seconds, "(0, 1e9]"),
         "segment_seconds",

@@ -29,7 +29,6 @@ from foldgauss.video.models.polynomial_folds import without_paths
 from foldgauss.video.models.shared_paths import SharedPaths
 from foldgauss.video.models.splats import FoldedSplats
 from foldgauss.video.models.video_model import VideoModel
-from foldgauss.video.motion.background_plate import fill_background
 from foldgauss.video.motion.camera_path import CameraPath, estimate_camera_path
 from foldgauss.video.motion.layer_clips import separate
 from foldgauss.video.motion.moving_object import NothingMoves, find_moving_object
@@ -97,7 +96,6 @@ __all__ = [
     "edit",
     "estimate_camera_path",
     "evaluate",
-    "fill_background",
     "find_moving_object",
     "fit",
     "fit_layers",

@@ -12,7 +12,7 @@ from foldgauss.video.fitting.config import FitConfig
 from foldgauss.video.fitting.loop import FitInfo, FitResult, finish, fit_steps
 from foldgauss.video.fitting.state import FitState
 from foldgauss.video.models.video_model import VideoModel
-from foldgauss.video.motion.background_plate import Frames
+from foldgauss.video.motion.background_plate import Alignment, Frames
 from foldgauss.video.motion.layer_clips import BACKGROUND, separate
 from foldgauss.video.motion.optical_flow import motion_finder
 
@@ -36,9 +36,12 @@ class LayerPlan(NamedTuple):
 
 
 def plan_layers(
-    frames: Frames, masks: Mapping[str, Bool[np.ndarray, "frames height width"]], config: FitConfig
+    frames: Frames,
+    masks: Mapping[str, Bool[np.ndarray, "frames height width"]],
+    config: FitConfig,
+    alignment: Alignment | None = None,
 ) -> list[LayerPlan]:
-    """The layers of a clip, from front to back: see `separate`.
+    """The layers of a clip, from front to back: see `separate`, which takes `alignment`, too.
 
     Frame times are not learned, so that they are the same in all layers. `minutes` are divided by the roots of the
     areas of the layers, since a step takes some time whatever the area, and `size_mb` by the areas, where a pixel of an
@@ -46,7 +49,7 @@ def plan_layers(
     the squared error is `OBJECT_ERROR` times as large in objects, and transparent pixels have none. Without masks, the
     background is the only layer.
     """
-    parts, unknown = separate(frames, masks) if masks else ({BACKGROUND: frames}, 0.0)
+    parts, unknown = separate(frames, masks, alignment=alignment) if masks else ({BACKGROUND: frames}, 0.0)
     cuts = motion_finder(frames)().cuts
     areas = np.array([mask.mean() for mask in masks.values()])
     least = LEAST_SHARE / max(len(areas), 1)

@@ -52,7 +52,7 @@ def test_a_job_leaves_its_model_and_its_record_alone(done):
 
 def test_what_is_done_is_not_done_again(done, monkeypatch):
     job, record = done
-    monkeypatch.delattr(fitting, "read_video")
+    monkeypatch.delattr(fitting, "read_clip_or_model")
     assert fit_job(job) == json.loads(json.dumps(record))
 
 

@@ -21,7 +21,7 @@ COMMANDS: Mapping[str, Command] = MappingProxyType(
         ),
         "view": Command("viewing.view", "Play and edit a model in the browser, or write the page that does."),
         "render": Command(
-            "viewing.render", "Render a model as a video: also between its frames, stabilized, or without an object."
+            "viewing.render", "Render a model as a video: also between its frames, stabilized, or some of its layers."
         ),
         "evaluate": Command("viewing.evaluate", "Compare a model with its clip: PSNR and SSIM of every frame."),
         "info": Command("viewing.info", "Show what a model file contains."),
@@ -75,8 +75,10 @@ EXAMPLES: Mapping[str, Mapping[str, str]] = MappingProxyType(
             "As from a tripod, borders filled from other frames": (
                 "foldgauss render holiday.fgz --stabilize fixed --border fill"
             ),
-            "Without the moving object, into holiday.plate.mp4": "foldgauss render holiday.fgz --plate",
-            "Without the object of masks of your own": "foldgauss render holiday.fgz --plate --masks masks",
+            "Without the objects of a fit with masks, into layers.background.mp4": (
+                "foldgauss render layers.fgz --layer background"
+            ),
+            "One object alone, with alpha": "foldgauss render layers.fgz --layer object --background none --out cutout",
         },
         "view": {
             "Play it in the browser": "foldgauss view holiday.fgz",

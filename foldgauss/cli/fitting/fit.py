@@ -104,7 +104,7 @@ def fit(
     A stopped fit has a checkpoint: the same command continues it. Long clips are fitted in segments, in parallel with
     workers. Options for rare cases: docs/fit.md.
     """
-    target, config = _choose_target(video, target, config)
+    target, config = _choose_target({"clip": video, "masks": masks and Path(masks)}, target, config)
     require(
         masks in (None, MOVING) or Path(masks).exists(),
         "--masks",
@@ -159,11 +159,12 @@ def fit(
     report_fit(display, str(target), figures | {"file_bytes": record["file_bytes"]})
 
 
-def _choose_target(video: Path, out_path: Path | None, config: FitConfig) -> tuple[Path, FitConfig]:
+def _choose_target(inputs: dict[str, Path | None], out_path: Path | None, config: FitConfig) -> tuple[Path, FitConfig]:
     """The file to write, and the settings: the default quality for a compact file of which nothing else is asked."""
     if out_path is None:
-        out_path = name_after(video, COMPACT_SUFFIX)
-    refuse_inputs(out_path, {"clip": video})
+        ending = ".fit" if inputs["clip"].suffix.lower() == COMPACT_SUFFIX else ""  # it may be a model in this folder
+        out_path = name_after(inputs["clip"], f"{ending}{COMPACT_SUFFIX}")
+    refuse_inputs(out_path, inputs)
     if out_path.suffix.lower() == COMPACT_SUFFIX:
         return out_path, config if config.is_compact else dataclasses.replace(config, quality=DEFAULT_QUALITY)
     require(

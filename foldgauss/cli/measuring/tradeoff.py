@@ -22,8 +22,8 @@ from foldgauss.cli.shared.files import make_folder, name_after, refuse_foreign
 from foldgauss.io._atomic import lock_output, write_or_keep
 from foldgauss.io.figures import write_figure
 from foldgauss.io.media.clip import Clip
-from foldgauss.io.media.reading import read_video
 from foldgauss.io.models.compact import COMPACT_SUFFIX
+from foldgauss.io.models.rendered_clip import read_clip_or_model
 from foldgauss.io.models.video_model import MODEL_SUFFIX, load_video_model
 from foldgauss.io.provenance import fingerprint
 from foldgauss.jobs import FitJob, Outcome
@@ -78,7 +78,7 @@ def tradeoff_command(
     path = out_dir / RECORD
     known = overwrite or path.exists()
     refuse_foreign(out_dir, FILES, "tradeoff", record=RECORD, known=known, cure=", or start over with --overwrite")
-    clip = read_video(video, frames=parse_frames(frames), size=parse_size(size))
+    clip = read_clip_or_model(video, frames=parse_frames(frames), size=parse_size(size))
     for text in clip.notes:
         warn(f"{clip.source}: {text}")
     make_folder(out_dir)

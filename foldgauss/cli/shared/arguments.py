@@ -24,7 +24,7 @@ ModelFile = Annotated[Path, typer.Argument(metavar="MODEL", help="Model file.")]
 FittedClip = Annotated[Path, typer.Argument(help="The clip that the model was fitted to.")]
 NewClip = Annotated[
     Path,
-    typer.Argument(help="Video file, folder of images in natural order, or one image."),
+    typer.Argument(help="Video file, folder of images in natural order, one image, or model file, which is rendered."),
 ]
 Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace existing outputs.")]
 Size = Annotated[str | None, typer.Option(metavar="HxW", help="Height x width in pixels, such as 160x320.")]

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Literal
 
 import numpy as np
-from jaxtyping import Int
+from jaxtyping import Float, Int
 
 from foldgauss._runtime.checks import ParameterError, invalid, is_within, require
 from foldgauss.io._atomic import PathLike, check_input, check_path
@@ -221,7 +221,7 @@ class ClipFacts:
     kind: Literal["video", "folder", "pictures"]
     fps: float | None
     num_total: int
-    stamps: Int[np.ndarray, " num_decoded"]
+    stamps: Int[np.ndarray, " num_decoded"] | Float[np.ndarray, " num_decoded"]
     time_base: float
     end: float = 0.0
     notes: list[str] = field(default_factory=list)

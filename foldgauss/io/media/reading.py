@@ -32,6 +32,20 @@ BLOCK_BYTES = 64 << 20
 CROP_REPORTED = 0.15
 
 
+def scan_clip(
+    path: Path, start: int, stop: int | None, keep: Callable[[Iterator[np.ndarray]], Sized]
+) -> tuple[Sized, ClipFacts]:
+    """What `keep` makes of the frames of a clip from `start` up to `stop`, and the facts about the clip.
+
+    The frames are BGR, or premultiplied BGRA if any pixel is transparent, as stored. Raises `VideoError` and OSError.
+    """
+    head = b"" if path.is_dir() else read_head(path)
+    if not path.is_dir() and (not is_image(head) or is_bare_jpegs(path, head)):
+        return scan_video(path, start, stop, keep)
+    scan = scan_folder if path.is_dir() else scan_picture
+    return scan(path, start, stop, keep)
+
+
 def read_video(
     path: PathLike,
     *,
@@ -39,6 +53,7 @@ def read_video(
     size: Size | None = None,
     fps: float | None = None,
     center_crop: Size | None = None,
+    scan: Callable[..., tuple[Sized, ClipFacts]] = scan_clip,
 ) -> Clip:
     """Read a video file, a folder of images in natural order (img2 before img10), or one image as a clip of one frame.
 
@@ -60,7 +75,8 @@ def read_video(
     `Clip.num_declared`. Unevenly spaced frames are all kept; see `Clip.times`.
 
     The format is detected from the first bytes, not from the name. No file or address that `path` refers to is opened,
-    such as the entries of a playlist. Images of more than 178,956,970 pixels are refused by their header.
+    such as the entries of a playlist. Images of more than 178,956,970 pixels are refused by their header. `scan` reads
+    files of other formats, as `scan_clip` does.
 
     Raises `FileNotFoundError` for a missing path, `VideoError` for everything else that cannot be read.
     """
@@ -76,26 +92,12 @@ def read_video(
     if fps is not None:
         check_fps(fps)
     with translate_os_errors(path):
-        kept, facts = scan_clip(path, start, stop, lambda images: stack_frames(map(prepare, images)))
+        kept, facts = scan(path, start, stop, lambda images: stack_frames(map(prepare, images)))
     num_declared, rate, notes = facts.describe_span(start, len(facts.stamps), stop, fps)
     if size is not None and center_crop is None:
         notes += describe_crop(sizes, size)
     about = str(path), num_declared, rate.times, notes, rate.first_second, rate.duration
     return Clip(kept, float(rate.fps), *about)
-
-
-def scan_clip(
-    path: Path, start: int, stop: int | None, keep: Callable[[Iterator[np.ndarray]], Sized]
-) -> tuple[Sized, ClipFacts]:
-    """What `keep` makes of the frames of a clip from `start` up to `stop`, and the facts about the clip.
-
-    The frames are BGR, or premultiplied BGRA if any pixel is transparent, as stored. Raises `VideoError` and OSError.
-    """
-    head = b"" if path.is_dir() else read_head(path)
-    if not path.is_dir() and (not is_image(head) or is_bare_jpegs(path, head)):
-        return scan_video(path, start, stop, keep)
-    scan = scan_folder if path.is_dir() else scan_picture
-    return scan(path, start, stop, keep)
 
 
 # -------------------------------------------------------------------------------------- sizes and memory

@@ -2,7 +2,6 @@
 
 import dataclasses
 import itertools
-import warnings
 
 import cv2
 import numpy as np
@@ -37,18 +36,13 @@ PLATE_FRAMES = 14
 PLATE_REACH = 40
 #: Holes of a plate are filled from frames in which at least this fraction of a pixel is uncovered.
 UNCOVERED = 250 / 255
-#: Where no frame shows more than this fraction of the removed area, half of that is farther than `MARGIN` from what is
-#: known: wider than the rims that interpolation closes unseen.
-MUCH_UNKNOWN = 0.1
 #: Texture is made anew where more than this fraction of what is unknown in a frame was in no other frame.
 NEW_TEXTURE = 0.1
 #: Texture is made in a window reduced to this longer side, in pixels. At half of the size it takes a fifth to a tenth
 #: of the time.
 TEXTURE_SIDE = 240
-#: What an object covers is replaced with this margin, a fraction of the longer side,
+#: What an object covers is replaced with this margin, a fraction of the longer side.
 MARGIN = 0.012
-#: and a soft edge of this width, a fraction of it too.
-SOFT_EDGE = 0.004
 
 Frames = UInt8[np.ndarray, "frames height width 3"]
 Masks = Bool[np.ndarray, "frames height width"]
@@ -136,33 +130,9 @@ def check_masks(frames: Frames, masks: np.ndarray) -> None:
     )
 
 
-def fill_background(frames: Frames, masks: Masks, *, alignment: Alignment | None = None) -> Frames:
-    """The frames without what the masks cover: other frames, moved as the background, show what is behind it.
-
-    See `complete_background`. Pixels away from the masks stay as they are. `alignment` aligns the frames. By default it
-    is estimated. Warns where more than `MUCH_UNKNOWN` of the pixels are shown by no frame.
-
-    Raises ValueError for frames of another type, and masks of another size.
-    Example: `fill_background(frames, find_moving_object(frames, shadow=True))`.
-    """
-    check_frames(frames)
-    check_masks(frames, masks)
-    covered = cover(masks)
-    plates, unknown = complete_background(frames, covered, alignment)
-    edge = max(SOFT_EDGE * max(frames.shape[1:3]), 0.5)
-    for k in np.flatnonzero(covered.any((1, 2))):
-        # From 0 at the border of what is replaced, where the blurred mask is a half, to 1.
-        weight = np.clip(2 * cv2.GaussianBlur(covered[k].astype(np.float32), (0, 0), edge) - 1, 0, 1)[..., None]
-        plates[k] = (weight * plates[k] + (1 - weight) * frames[k]).round()
-    if unknown > MUCH_UNKNOWN:
-        text = f"{unknown:.0%} of the removed area is shown by no frame and filled with texture from its surroundings."
-        warnings.warn(f"{text} Take more frames, in which the object moves away from it.", stacklevel=2)
-    return plates
-
-
-def cover(masks: Masks) -> Masks:
-    """The masks grown by `MARGIN`: what is outside them is taken to be background."""
-    diameter = 2 * round(MARGIN * max(masks.shape[1:])) + 1
+def cover(masks: Masks, margin: float = MARGIN) -> Masks:
+    """The masks grown by a fraction of the longer side: what is outside `MARGIN` is taken to be background."""
+    diameter = 2 * round(margin * max(masks.shape[1:])) + 1
     return np.stack([dilate(mask, diameter) for mask in masks])
 
 
