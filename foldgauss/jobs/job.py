@@ -57,8 +57,9 @@ class FitJob:
     `size` is the (height, width) of the frames, or None; `frames` the range (first, stop) of the clip, or None. With
     `index`, the file of a `FrameIndex`, frames are found by seeking, and counted from the first one of the index. `fps`
     replaces the clip's frame rate. `source` identifies the clip: results of another source are not reused. `masks` is
-    the path of the masks of objects that get layers of their own, or `MOVING` for the object that moves. `metadata` is
-    added to the metadata of the model file. Checkpoint and record are in `folder`, by default beside the model.
+    the path of the masks of objects that get layers of their own, `MOVING` for the object that moves, or "X,Y" or
+    "X,Y@FRAME" for the one there. `metadata` is added to the metadata of the model file. Checkpoint and record are in
+    `folder`, by default beside the model.
     """
 
     name: str

@@ -21,18 +21,16 @@ from foldgauss import __version__
 from foldgauss._runtime.checks import require
 from foldgauss.io import Clip, FrameIndex, read_indexed, save_video_model
 from foldgauss.io._atomic import OutputError, atomic_path, lock_output, write_or_keep
-from foldgauss.io.media.masks import read_object_masks
 from foldgauss.io.models.checkpoint import is_known_good, load_checkpoint, save_checkpoint
 from foldgauss.io.models.compact import COMPACT_SUFFIX, leave_room, save_compact
 from foldgauss.io.models.rendered_clip import is_model, place_in_clip, read_clip_or_model
 from foldgauss.io.provenance import describe_reading, describe_source, fingerprint
-from foldgauss.jobs.job import MOVING, FitJob, file_digest, limit_range, read_record
+from foldgauss.jobs.job import FitJob, file_digest, limit_range, read_record
+from foldgauss.jobs.object_masks import find_masks
 from foldgauss.video import Evaluation, FitConfig, FitDiverged, FitState, VideoModel, evaluate
 from foldgauss.video.fitting.loop import FitInfo, finish, fit_steps
 from foldgauss.video.layered import LayerPlan, plan_layers, stack
-from foldgauss.video.motion.background_plate import Alignment, cover
-from foldgauss.video.motion.layer_clips import BAND
-from foldgauss.video.motion.moving_object import NothingMoves, find_moving_object
+from foldgauss.video.motion.background_plate import Alignment
 
 #: Seconds between two checkpoints of a running fit.
 CHECKPOINT_SECONDS = 30.0
@@ -179,28 +177,8 @@ def _plan_layers(job: FitJob, clip: Clip, first: int) -> list[LayerPlan]:
         got=repr(clip.source),
         cure="Its alpha cuts out the object.",
     )
-    masks = {}
-    if job.masks != MOVING:
-        read = read_object_masks(job.masks, first, clip.num_frames, clip.size, crop=job.size is not None)
-        masks = {name: own for name, own in read.items() if own.any()}
     alignment = Alignment.from_frames(clip.frames)
-    if job.masks == MOVING:
-        with suppress(NothingMoves):
-            found = find_moving_object(clip.frames, alignment=alignment)
-            # They are found on small images: some pixels of the object are beside them.
-            masks, covered = {"object": cover(found, BAND)}, found.mean((1, 2))[found.any((1, 2))]
-            area = f"{covered.min():.1%} to {covered.max():.1%} of the image, in {len(covered)} of {len(found)} frames"
-            warnings.warn(
-                f"What moves covers {area}. Parts that stand still are not found: masks may have them.",
-                stacklevel=2,
-            )
-    require(
-        masks or job.index is not None,  # in a part there may be no object
-        "masks",
-        expected="an object in these frames",
-        got="none that moves" if job.masks == MOVING else f"none in {job.masks!r}",
-        cure="Give masks of the object." if job.masks == MOVING else "",
-    )
+    masks = find_masks(job, clip, first, alignment)
     if len(alignment.starts) > 1:
         starts = ", ".join(map(str, alignment.starts))
         warnings.warn(

@@ -30,6 +30,7 @@ from foldgauss.video.models.shared_paths import SharedPaths
 from foldgauss.video.models.splats import FoldedSplats
 from foldgauss.video.models.video_model import VideoModel
 from foldgauss.video.motion.camera_path import CameraPath, estimate_camera_path
+from foldgauss.video.motion.followed_object import follow_object
 from foldgauss.video.motion.layer_clips import separate
 from foldgauss.video.motion.moving_object import NothingMoves, find_moving_object
 from foldgauss.video.motion.slow_motion import interpolate_frames
@@ -100,6 +101,7 @@ __all__ = [
     "fit",
     "fit_layers",
     "fit_steps",
+    "follow_object",
     "influence",
     "interpolate_frames",
     "interpolated_times",

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from commands import call
 from panned_clips import SIZE, disc_clip, panned, texture
+from test_moving_object import overlap
 
 from foldgauss.io import load_video_model, read_video, save_compact, save_video_model, write_frames
 from foldgauss.io.edit_script import EditScriptError, parse_edit_script
@@ -20,7 +21,9 @@ from foldgauss.video.layered import fit_layers, plan_layers
 from foldgauss.video.motion.background_plate import complete_background, cover, fill_with_texture
 from foldgauss.video.motion.layer_clips import separate
 
-pytestmark = pytest.mark.filterwarnings("default:What moves covers", "default:.*behind objects is")
+pytestmark = pytest.mark.filterwarnings(
+    "default:What moves covers", "default:.*behind objects is", "default:The object is followed"
+)
 CONFIG = FitConfig(quality=60.0, steps=300)
 
 
@@ -251,13 +254,38 @@ def test_a_model_is_fitted_in_layers(folders, clip):
     assert read_metadata("m.fit.fgz")["frames"] == [1, 8]
 
 
+def test_an_object_is_followed_from_masks_of_some_frames_or_a_click(folders, clip):
+    _, _, truth = clip
+    write_frames(folders / "two", np.repeat(255 * np.uint8(truth[[1, 6]])[..., None], 3, -1))
+    (folders / "two" / "00000.png").rename(folders / "two" / "00006-.png")  # of no frame's name: without a number
+    (folders / "two" / "00001.png").rename(folders / "two" / "mask0006.png")
+    (folders / "two" / "00006-.png").rename(folders / "two" / "00001.png")
+    ways = {"two": "followed from 2 masks", "masks/00002.png": "from 1 masks", "64,43@2": "What moves covers"}
+    for masks, told in ways.items():
+        call(*FIT[:3], masks, *FIT[4:], "--overwrite", err=told)
+        alpha = np.stack([image[..., 3] for image in load_video_model("a.fgz").layers[0].model.frames(background=None)])
+        assert overlap(alpha > 128, truth).mean() > 0.75, masks
+    call(*FIT[:3], "64,43@9", *FIT[4:], "--overwrite", code=2, err="at: expected (frame, x, y) below (8, 160, 90)")
+    call(
+        *FIT[:3],
+        "masks/00002.png",
+        *FIT[4:],
+        "--frames",
+        "4:8",
+        code=2,
+        err="masks: expected one of a frame from 4 to 7",
+    )
+    for masks in ("64,43", "two"):
+        call(*FIT[:3], masks, *FIT[4:], "--segment-seconds", 0.16, code=2, err="in segments")
+
+
 def test_what_moves_is_found_in_each_shot_or_asked_for(folders, clip):
     frames, empty, _ = clip
     write_frames(folders / "shots", np.concatenate([frames[:5], frames[:5, ::-1, ::-1]]))
     write_frames(folders / "still", np.tile(empty[:1], (4, 1, 1, 1)))
     told = "What is behind objects is found in each shot on its own. Shots begin at frames 0, 5."
     call("fit", "shots", "--masks", "moving", "--steps", 3, err=told)
-    told = "masks: expected an object in these frames, got none that moves. Give masks of the object."
+    told = "masks: expected an object in these frames, got none that moves. Give masks of the object: one"
     call("fit", "still", "--masks", "moving", "--steps", 3, code=2, err=told)
 
 
@@ -332,17 +360,15 @@ def test_segments_without_an_object_have_a_background_only(folders, clip):
 def test_masks_of_the_whole_clip_are_cut(folders, clip):
     _, _, masks = clip
     part = read_object_masks("masks", 2, 3, SIZE)
-    assert (part["object"] == masks[2:5]).all()
+    assert [(k, (own == masks[2 + k]).all()) for k, own in part["object"].items()] == [(0, True), (1, True), (2, True)]
     labels = np.uint8(masks) + 0
     labels[:, :10, :10] = 7
     write_frames(folders / "two", np.repeat(labels[..., None], 3, -1))
     both = read_object_masks("two", 0, 8, SIZE)
     assert list(both) == ["object 1", "object 7"]
-    assert (both["object 1"] == (labels == 1)).all()
+    assert (np.stack(list(both["object 1"].values())) == (labels == 1)).all()
     call("fit", "clip", "--masks", "two", "--frames", "0:4", "--steps", 5, "--out", "b.fgz", "--quiet")
-    call(
-        "fit", "clip", "--masks", "nothing", code=2, err="--masks: expected a folder, an image or a video, or 'moving'"
-    )
+    call("fit", "clip", "--masks", "nothing", code=2, err="--masks: expected a folder, an image or a video, X,Y")
     write_frames(folders / "wide", np.repeat(255 * np.uint8(masks[:, :45])[..., None], 3, -1))
     call("fit", "clip", "--masks", "wide", code=2, err="masks: expected the aspect of the clip, 90x160")
     call("fit", "clip", "--masks", "wide", "--size", "40x160", "--steps", 3, "--out", "c.fgz", "--quiet")

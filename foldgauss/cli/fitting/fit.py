@@ -50,6 +50,7 @@ from foldgauss.io.models.video_model import MODEL_SUFFIX
 from foldgauss.jobs import FitJob
 from foldgauss.jobs import Stopped as FitStopped
 from foldgauss.jobs.job import MOVING
+from foldgauss.jobs.object_masks import parse_click
 from foldgauss.jobs.runner import run_fit
 from foldgauss.jobs.segments import SEGMENT_SECONDS, has_plan
 from foldgauss.video import Evaluation, FitDiverged, FitInfo
@@ -78,8 +79,8 @@ def fit(
     masks: Annotated[
         str | None,
         typer.Option(
-            metavar=f"PATH|{MOVING}",
-            help="Masks of objects: each gets a layer.",
+            metavar="PATH|X,Y",
+            help=f"Masks, click or {MOVING!r}: objects get layers.",
         ),
     ] = None,
     overwrite: Overwrite = False,
@@ -104,11 +105,12 @@ def fit(
     A stopped fit has a checkpoint: the same command continues it. Long clips are fitted in segments, in parallel with
     workers. Options for rare cases: docs/fit.md.
     """
-    target, config = _choose_target({"clip": video, "masks": masks and Path(masks)}, target, config)
+    is_found = masks in (None, MOVING) or parse_click(masks) is not None
+    target, config = _choose_target({"clip": video, "masks": None if is_found else Path(masks)}, target, config)
     require(
-        masks in (None, MOVING) or Path(masks).exists(),
+        is_found or Path(masks).exists(),
         "--masks",
-        expected=f"a folder, an image or a video, or {MOVING!r}",
+        expected=f"a folder, an image or a video, X,Y or X,Y@FRAME of a click, or {MOVING!r}",
         got=f"{masks!r}, which is missing",
     )
     job = FitJob(
@@ -119,7 +121,7 @@ def fit(
         parse_size(size),
         parse_frames(frames),
         checkpoint_seconds=checkpoint_seconds,
-        masks=masks if masks in (None, MOVING) else str(Path(masks).absolute()),
+        masks=masks if is_found else str(Path(masks).absolute()),
     )
     require(
         history is None or masks is None,

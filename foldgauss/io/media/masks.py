@@ -1,5 +1,6 @@
 """Object masks from images, folders of images and videos."""
 
+import re
 import warnings
 from collections.abc import Sequence
 from pathlib import Path
@@ -94,43 +95,61 @@ def read_masks(
 
 
 def read_object_masks(
-    path: PathLike, first: int, num_frames: int, size: Size, *, crop: bool = True
-) -> dict[str, Bool[np.ndarray, "num_frames height width"]]:
-    """The masks of each object, by name, for `num_frames` frames of `size`, from frame `first` of the clip on.
+    path: PathLike, first: int, num_frames: int, size: Size, *, names: Sequence[str] = (), crop: bool = True
+) -> dict[str, dict[int, Bool[np.ndarray, "height width"]]]:
+    """The masks of each object, by name and frame, for `num_frames` frames of `size`, from frame `first` of a clip on.
 
-    A folder of label images, one for each frame of the clip or of the part, or an image of one frame: objects are
-    called "object", or "object 1", "object 2" by their labels; a video has one. Masks of another aspect than `size` are
-    cropped around the center, or refused if `crop` is False. Then they are resized. An object may have no pixels in a
-    part.
-    Raises as `read_masks`, and ValueError for another number of masks, and where no object is in them.
+    A folder of label images, or one: objects are called "object", or "object 1", "object 2" by their labels; a video
+    has one. There is a mask for each frame of the clip or of the part, or images of some of the clip's frames. Each
+    then is of the frame with its name among `names`, those of the clip's images, or else of the frame whose number its
+    name ends with, or else of the first one. Masks of another aspect than `size` are cropped around the center, or
+    refused if `crop` is False. Then they are resized. Objects without pixels are left out, and
+    so are their masks of single frames.
+
+    Raises as `read_masks`, and ValueError for fewer frames of a video, and where no object is in the masks.
     """
     path = check_path(path)
     check_input(path, "a folder, an image or a video")
-    if path.is_dir() or path.suffix.lower() in IMAGE_SUFFIXES:
-        labels = read_labels(choose_images(path, 0, None) if path.is_dir() else [path])
-        numbers = sorted(set(np.unique(labels).tolist()) - {0, VOID})
-        masks = {f"object {k}" if len(numbers) > 1 else "object": labels == k for k in numbers}
+    files = choose_images(path, 0, None) if path.is_dir() else [path] * (path.suffix.lower() in IMAGE_SUFFIXES)
+    labels = read_labels(files) if files else np.uint8(read_masks(path))
+    numbers = sorted(set(np.unique(labels).tolist()) - {0, VOID})
+    require(numbers, "masks", expected="an object in them", got=f"none in {str(path)!r}")
+    if len(labels) >= num_frames:
+        labels = labels[first:] if len(labels) >= first + num_frames else labels
+        frames = dict(enumerate(labels[:num_frames]))
     else:
-        masks = {"object": read_masks(path)}
-    require(any(map(np.any, masks.values())), "masks", expected="an object in them", got=f"none in {str(path)!r}")
-    for name, own in masks.items():
-        own = own[first:] if len(own) >= first + num_frames else own
+        require(files, "masks", expected=f"one for each of {num_frames} frames", got=f"{len(labels)} in {str(path)!r}")
+        frames = {_find_frame(file, names) - first: own for file, own in zip(files, labels, strict=True)}
+        frames = {k: own for k, own in frames.items() if 0 <= k < num_frames}
         require(
-            len(own) >= num_frames,
+            frames,
             "masks",
-            expected=f"one for each of {num_frames} frames",
-            got=f"{len(own)} in {str(path)!r}",
+            expected=f"one of a frame from {first} to {first + num_frames - 1}",
+            got=f"others in {str(path)!r}",
+            cure="The name of an image ends with the number of its frame.",
         )
-        height, width = own.shape[1:]
-        require(
-            crop or abs(height * size[1] - width * size[0]) <= max(height, width, *size),
-            "masks",
-            expected=f"the aspect of the clip, {format_size(size)}",
-            got=format_size((height, width)),
-        )
-        own = np.uint8(own[:num_frames, *aspect_window(own.shape[1:], size)])
-        masks[name] = np.stack([cv2.resize(mask, size[::-1], interpolation=cv2.INTER_NEAREST) > 0 for mask in own])
-    return masks
+    height, width = labels.shape[1:]
+    require(
+        crop or abs(height * size[1] - width * size[0]) <= max(height, width, *size),
+        "masks",
+        expected=f"the aspect of the clip, {format_size(size)}",
+        got=format_size((height, width)),
+    )
+    window, found = aspect_window((height, width), size), {}
+    for number in numbers:
+        own = {
+            k: cv2.resize(np.uint8(label[window] == number), size[::-1], interpolation=cv2.INTER_NEAREST) > 0
+            for k, label in frames.items()
+            if len(frames) == num_frames or (label == number).any()
+        }
+        if any(mask.any() for mask in own.values()):
+            found[f"object {number}" if len(numbers) > 1 else "object"] = own
+    return found
+
+
+def _find_frame(file: Path, names: Sequence[str]) -> int:
+    digits = re.search("[0-9]*$", file.stem)[0]
+    return names.index(file.stem) if file.stem in names else int(digits or 0)
 
 
 def _select_label(paths: list[Path], label: int | None, source: Path) -> Bool[np.ndarray, "num_frames height width"]:

@@ -28,7 +28,7 @@ from foldgauss.video.motion.moving_object import (
     run_all,
     track,
 )
-from foldgauss.video.motion.optical_flow import pixel_grid
+from foldgauss.video.motion.optical_flow import motion_finder, pixel_grid
 
 #: Lightness is counted in so many bins, and the two color axes of Lab in as many, each of `HUE_BIN` levels,
 COLOR_BINS = 14
@@ -71,6 +71,8 @@ LEAST_TRUST = 0.3
 EDGE_SMOOTHING, EDGE_LEVELS = 300.0, 6.0
 #: An object is hidden where its area is below this fraction of the usual one.
 HIDDEN = 0.35
+#: It is seen as a whole where its area is above this fraction.
+WHOLE = 0.7
 #: The usual area follows that of each frame at this rate.
 AREA_RATE = 0.15
 #: The smallest piece, in pixels.
@@ -114,16 +116,30 @@ def follow_object(
     given = {int(k): np.asarray(mask) for k, mask in sorted(masks.items()) if np.any(mask)}
     require(given, "masks", expected="one that is not empty, at least", got="none")
     alignment = Alignment.from_frames(frames) if alignment is None else alignment
-    small, found, missing = resize_frames(frames), np.zeros(frames.shape[:3], bool), []
-    for first, stop in alignment.shots:
+    small, found, shots = resize_frames(frames), np.zeros(frames.shape[:3], bool), alignment.shots
+    followed: dict[int, list[Probability]] = {}  # by the first frame of a shot
+
+    def follow(first: int, stop: int, own: dict[int, Probability]) -> None:
+        followed[first] = _follow_in_shot(small[first:stop], alignment.of_shot(first, stop), own)
+
+    for first, stop in shots:
         own = {k - first: _resize(mask, small.shape[1:3]) for k, mask in given.items() if first <= k < stop}
         if own:
-            followed = _follow_in_shot(small[first:stop], alignment.of_shot(first, stop), own)
-            found[first:stop] = [_resize(inside, frames.shape[1:3]) > 0.5 for inside in followed]
-        else:
-            missing.append(f"{first}:{stop}")
+            follow(first, stop, own)
+    # What moves fast may hide the background's motion: then a shot of the alignment does not begin with a cut.
+    cuts = motion_finder(frames)().cuts if len(followed) < len(shots) else []
+    for (first, middle), (_, stop) in itertools.pairwise(shots):
+        if middle not in cuts and first in followed and middle not in followed:
+            follow(middle, stop, {0: pull(followed[first][-1], alignment.flow(middle, middle - 1)[0])})
+    for (first, middle), _ in reversed(list(itertools.pairwise(shots))):
+        if middle not in cuts and middle in followed and first not in followed:
+            last = pull(followed[middle][0], alignment.flow(middle - 1, middle)[0])
+            follow(first, middle, {middle - first - 1: last})
+    for first, inside in followed.items():
+        found[first : first + len(inside)] = [_resize(one, frames.shape[1:3]) > 0.5 for one in inside]
     for k, mask in given.items():
         found[k] = mask
+    missing = [f"{first}:{stop}" for first, stop in shots if first not in followed]
     if missing:
         warnings.warn(f"No mask is given in the shots of frames {', '.join(missing)}: none is found.", stacklevel=2)
     return found
@@ -168,19 +184,19 @@ def _follow(
     """The object in the frames of `order`, from the given mask `inside` of the first one on."""
     clues.learn(order[0], inside)
     yield inside
-    usual, hidden, seen, speed = inside.sum(), 0, inside > 0.5, np.zeros(2)
+    usual, hidden, whole, speed, moved = inside.sum(), 0, inside > 0.5, np.zeros(2), np.zeros(2)
     for before, k in itertools.pairwise(order):
         ahead, back = alignment.flow(k, before)
         expected, trust = pull(inside, ahead), LEAST_TRUST + (1 - LEAST_TRUST) * measure_agreement(ahead, back)
+        if (inside > 0.5).sum() > WHOLE * usual:
+            whole, moved = inside > 0.5, np.zeros(2)
+            own = np.median(alignment.flow(before, k)[0][whole], axis=0)
+            speed = (1 - SPEED_RATE) * speed + SPEED_RATE * own if speed.any() else own
+        moved = moved + speed
         if hidden and tracked[k].any():
             expected = np.maximum(expected, REFOUND * tracked[k])
         elif hidden:
-            moved = scipy.ndimage.shift(np.float32(seen), hidden * speed[::-1], order=0)
-            expected = np.maximum(expected, 0.5 * moved)
-        elif (inside > 0.5).any():
-            speed = (1 - SPEED_RATE) * speed + SPEED_RATE * np.median(
-                alignment.flow(before, k)[0][inside > 0.5], axis=0
-            )
+            expected = np.maximum(expected, 0.5 * scipy.ndimage.shift(np.float32(whole), moved[::-1], order=0))
         reach = REACH + SEARCH * hidden * (not tracked[k].any())
         odds = _limit_odds(cv2.GaussianBlur(expected, (0, 0), BLUR)) * trust / (1 + hidden)
         odds += clues.judge_color(k, _find_center(expected)) + clues.judge_motion(k)
@@ -190,7 +206,7 @@ def _follow(
         if area < HIDDEN * usual:
             hidden += 1
         else:
-            hidden, seen, usual = 0, inside > 0.5, (1 - AREA_RATE) * usual + AREA_RATE * area
+            hidden, usual = 0, (1 - AREA_RATE) * usual + AREA_RATE * area
             clues.learn(k, inside)
         yield inside
 

@@ -391,7 +391,10 @@ def _count(bins: Int32[np.ndarray, " pixels"]) -> np.ndarray:
 
 
 def _track_best(pieces, evidence, alignment: Alignment, place: tuple[int, int, int] | None) -> Masks | None:
-    """The object whose track has most evidence; tracks begin at the best piece of every `SEED_SPACING`-th frame."""
+    """The object whose track has most evidence; tracks begin at the best piece of every `SEED_SPACING`-th frame.
+
+    `place` = (frame, x, y): the object there.
+    """
     if place is not None:
         k, x, y = place
         near = scipy.ndimage.distance_transform_edt(pieces[k] == 0, return_distances=False, return_indices=True)
