@@ -13,8 +13,11 @@ from foldgauss.io.media.masks import read_object_masks
 from foldgauss.jobs.job import MOVING, FitJob
 from foldgauss.video.motion.background_plate import Alignment, Masks, cover
 from foldgauss.video.motion.followed_object import follow_object
-from foldgauss.video.motion.layer_clips import BAND
 from foldgauss.video.motion.moving_object import NothingMoves, find_moving_object
+
+#: The masks of what moves are widened by this fraction of the longer side: they are found on images of 480 pixels, and
+#: without it shreds of the object's outline stay in the background. (Chosen by eye: car-shadow, lady-running, bikes.)
+WIDENING = 0.004
 
 
 def parse_click(masks: str | None) -> tuple[int, float, float] | None:
@@ -46,7 +49,7 @@ def find_masks(job: FitJob, clip: Clip, first: int, alignment: Alignment) -> dic
                 cure="Leave the segments out, or give masks of all frames.",
             )
             followed = follow_object(clip.frames, own, alignment=alignment)
-            found[name] = cover(followed, BAND)
+            found[name] = cover(followed, WIDENING)
             for k, mask in own.items():
                 found[name][k] = mask
             text = f"The {name} is followed from {len(own)} masks. It covers {_describe(followed)}."
@@ -70,8 +73,7 @@ def _find_moving(
         raise invalid("masks", expected=expected, got=f"none that moves{where}", cure=cure) from error
     text = f"What moves covers {_describe(masks)}. Parts that stand still are not found: masks may have them."
     warnings.warn(text, stacklevel=2)
-    # They are found on small images: some pixels of the object are beside them.
-    return {"object": cover(masks, BAND)}
+    return {"object": cover(masks, WIDENING)}
 
 
 def _describe(masks: Masks) -> str:

@@ -130,7 +130,7 @@ def test_a_compact_file_needs_a_goal(clip, tmp_path):
 
 @pytest.mark.parametrize(
     ("goals", "num"),
-    [({"psnr": 99.0}, 1), ({"psnr": 5.0}, 0), ({"psnr": 99.0, "size_mb": 1.0}, 1), ({"psnr": 99.0, "quality": 1.0}, 0)],
+    [({"psnr": 99.0}, 1), ({"psnr": 5.0}, 0), ({"psnr": 99.0, "size_mb": 1.0}, 1), ({"psnr": 99.0, "quality": 1.0}, 1)],
 )
 def test_a_psnr_out_of_reach_is_noted(clip, tmp_path, goals, num):
     job = job_of(clip, tmp_path, "model.fgz", config=dataclasses.replace(CONFIG, **goals))
