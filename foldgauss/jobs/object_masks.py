@@ -63,6 +63,13 @@ def _find_moving(
     clip: Clip, click: tuple[int, float, float] | None, alignment: Alignment, is_part: bool
 ) -> dict[str, Masks]:
     """The largest object that moves, or that at `click`."""
+    last, height, width = clip.num_frames - 1, *clip.size
+    require(
+        click is None or (0 <= click[0] <= last and click[1] < width and click[2] < height),
+        "masks",
+        expected=f"a click in frames of {width}x{height} pixels, of which there are {last + 1}",
+        got=click and "{1:g},{2:g} in frame {0} of them".format(*click),
+    )
     try:
         masks = find_moving_object(clip.frames, at=click, alignment=alignment)
     except NothingMoves as error:
