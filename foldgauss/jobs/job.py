@@ -58,8 +58,8 @@ class FitJob:
     `index`, the file of a `FrameIndex`, frames are found by seeking, and counted from the first one of the index. `fps`
     replaces the clip's frame rate. `source` identifies the clip: results of another source are not reused. `masks` is
     the path of the masks of objects that get layers of their own, `MOVING` for the object that moves, or "X,Y" or
-    "X,Y@FRAME" for the one there. `metadata` is added to the metadata of the model file. Checkpoint and record are in
-    `folder`, by default beside the model.
+    "X,Y@FRAME" for the one there, with their `shadows` or without. `metadata` is added to the metadata of the model
+    file. Checkpoint and record are in `folder`, by default beside the model.
     """
 
     name: str
@@ -75,6 +75,7 @@ class FitJob:
     source: dict[str, Any] = dataclasses.field(default_factory=dict)
     metadata: dict[str, Any] = dataclasses.field(default_factory=dict)
     masks: str | None = None
+    shadows: bool = False
 
     @property
     def request(self) -> dict[str, Any]:
@@ -84,6 +85,7 @@ class FitJob:
             "size": self.size,
             "frames": self.frames,
             "masks": self.masks,
+            "shadows": self.shadows,
         }
         return json.loads(json.dumps(asked | {"source": self.source}))
 

@@ -185,7 +185,7 @@ def _plan_layers(job: FitJob, clip: Clip, first: int) -> list[LayerPlan]:
             f"What is behind objects is found in each shot on its own. Shots begin at frames {starts}.",
             stacklevel=2,
         )
-    plans = plan_layers(clip.frames, masks, job.config, alignment)
+    plans = plan_layers(clip.frames, masks, job.config, shadows=job.shadows, alignment=alignment)
     if plans[-1].unknown >= LEAST_TOLD:
         warnings.warn(
             f"{plans[-1].unknown:.0%} of what is behind objects is shown by no frame: texture replaces it.",

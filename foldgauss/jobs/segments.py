@@ -129,14 +129,15 @@ def plan_long_fit(
     overlap: int = OVERLAP,
     checkpoint_seconds: float | None = None,
     masks: str | None = None,
+    shadows: bool = False,
     restart: bool = False,
 ) -> LongFit:
     """Index a clip and plan its segments, or continue the plan that exists, unless `restart`.
 
     Segments end at scene cuts near their length, `segment_seconds`; otherwise they share `overlap` frames with the
     next. Each segment has the settings `config`, and a part of `size_mb` in proportion to its frames. `clip`, `size`
-    and `frames` as in `read_video`, `masks` as of `FitJob`. Memory grows with the clip by some tens of bytes per frame
-    only.
+    and `frames` as in `read_video`, `masks` and `shadows` as of `FitJob`. Memory grows with the clip by some tens of
+    bytes per frame only.
 
     Raises ValueError for settings out of range, for a folder with the plan of other settings or another clip, and with
     `restart` for one with other files; `VideoError`, FileNotFoundError, `OutputError`.
@@ -160,7 +161,7 @@ def plan_long_fit(
     require(is_integer(overlap, 1), "overlap", expected="a whole number of frames >= 1", got=repr(overlap))
     clip, target = Path(clip).absolute(), Path(target).absolute()
     folder = segments_folder(target)
-    request = flatten(dataclasses.asdict(config)) | {"size": size, "frames": frames, "masks": masks}
+    request = flatten(dataclasses.asdict(config)) | {"size": size, "frames": frames, "masks": masks, "shadows": shadows}
     request = json.loads(json.dumps(request | {"segment_seconds": float(segment_seconds), "overlap": overlap}))
     if restart:
         _check_folder(folder)
@@ -208,6 +209,7 @@ def plan_long_fit(
             source={"digest": index.digest},
             metadata={"clip": clip.name, "frames": [begin + span[0], begin + span[1]]},
             masks=masks,
+            shadows=shadows,
         )
         for number, (span, own) in enumerate(zip(spans, configs, strict=True))
     )

@@ -39,9 +39,11 @@ def plan_layers(
     frames: Frames,
     masks: Mapping[str, Bool[np.ndarray, "frames height width"]],
     config: FitConfig,
+    *,
+    shadows: bool = False,
     alignment: Alignment | None = None,
 ) -> list[LayerPlan]:
-    """The layers of a clip, from front to back: see `separate`, which takes `alignment`, too.
+    """The layers of a clip, from front to back: see `separate`, which takes `shadows` and `alignment`, too.
 
     Frame times are not learned, so that they are the same in all layers. `minutes` are divided by the roots of the
     areas of the layers, since a step takes some time whatever the area, and `size_mb` by the areas, where a pixel of an
@@ -49,7 +51,9 @@ def plan_layers(
     the squared error is `OBJECT_ERROR` times as large in objects, and transparent pixels have none. Without masks, the
     background is the only layer.
     """
-    parts, unknown = separate(frames, masks, alignment=alignment) if masks else ({BACKGROUND: frames}, 0.0)
+    parts, unknown = (
+        separate(frames, masks, shadows=shadows, alignment=alignment) if masks else ({BACKGROUND: frames}, 0.0)
+    )
     cuts = motion_finder(frames)().cuts
     areas = np.array([mask.mean() for mask in masks.values()])
     least = LEAST_SHARE / max(len(areas), 1)
@@ -80,19 +84,20 @@ def fit_layers(
     masks: Mapping[str, Bool[np.ndarray, "frames height width"]],
     config: FitConfig | None = None,
     *,
+    shadows: bool = False,
     fps: float = 25.0,
     observers: Iterable[Callable[[FitState, FitInfo], None]] = (),
 ) -> tuple[EditedVideo, dict[str, FitResult]]:
     """Fit each object of `masks`, and the background without them, with Gaussians of its own.
 
     The layers composited are the clip. An object keeps its outline wherever it is moved, and the background is whole
-    behind it. Returns the video, whose layers have the names of the masks and "background", and the result of each
-    layer. Other arguments as of `fit`. Raises as `fit` and `separate`.
+    behind it. With `shadows`, objects have theirs. Returns the video, whose layers have the names of the masks and
+    "background", and the result of each layer. Other arguments as of `fit`. Raises as `fit` and `separate`.
 
     Example: `fit_layers(clip.frames, {"ball": masks}, FitConfig(steps=1000))[0].render(0.5)`. Source: VeGaS, section 4.
     """
     observers, results = list(observers), {}
-    for plan in plan_layers(frames, masks, FitConfig() if config is None else config):
+    for plan in plan_layers(frames, masks, FitConfig() if config is None else config, shadows=shadows):
         for state, info in fit_steps(plan.frames, plan.config, cuts=plan.cuts):
             for observe in observers:
                 observe(state, info)

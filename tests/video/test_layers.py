@@ -64,6 +64,25 @@ def test_layers_make_up_the_clip_and_are_those_it_was_made_of(clip):
     assert np.mean(list(map(psnr, empty, layers["background"]))) > 26
 
 
+def test_a_shadow_goes_with_its_object_or_stays():
+    frames, empty, masks = disc_clip(2.0, 8.0, num_frames=10)
+    y, x = np.mgrid[: SIZE[0], : SIZE[1]]
+    shadow = np.stack([np.hypot((x - 62 - 8 * k) / 14, (y - 60 - 0.5 * k) / 7) < 1 for k in range(10)]) & ~masks
+    light = 1 - 0.5 * cv2.GaussianBlur(np.float32(shadow).transpose(1, 2, 0), (0, 0), 1).transpose(2, 0, 1)[..., None]
+    shaded = np.where(masks[..., None], frames, frames * light).round().astype(np.uint8)
+    core = np.stack([cv2.erode(np.uint8(one), np.ones((5, 5))) for one in shadow & ~cover(masks, 0.02)]) > 0
+    with_it, _ = separate(shaded, {"disc": masks}, shadows=True)
+    without, _ = separate(shaded, {"disc": masks})
+    assert np.abs(with_it["disc"][core][:, 3] / 255 - 0.5).mean() < 0.1
+    assert with_it["disc"][core][:, :3].mean() < 12
+    assert (without["disc"][core] == 0).all()
+    off = [np.abs(one["background"].astype(float) - empty)[core].mean() for one in (with_it, without)]
+    assert off[0] < 8 < 50 < off[1]
+    assert min(map(psnr, shaded, composite(with_it))) > 40
+    none, _ = separate(frames, {"disc": masks}, shadows=True)
+    assert (none["disc"][..., 3] > 0)[~cover(masks, 0.02)].mean() < 0.002
+
+
 def test_soft_edges_are_found_where_the_colors_differ():
     behind, front = np.full((4, 60, 80, 3), (30, 60, 200), np.uint8), np.array([220, 120, 20])
     x = np.arange(80)
@@ -243,7 +262,8 @@ def test_the_command_fits_layers(folders, clip):
     told = call(*FIT[:2], "--masks", "moving", *FIT[4:], "--overwrite").err
     assert re.search(found, " ".join(told.split()))
     assert len(load_video_model("a.fgz").layers) == 2
-    call("fit", "clip", "--masks", "masks", "--steps", 40, "--out", "a.safetensors", "--quiet")
+    call("fit", "clip", "--masks", "masks", "--shadows", "--steps", 40, "--out", "a.safetensors", "--quiet")
+    call("fit", "clip", "--shadows", code=2, err="--shadows: expected a fit with --masks, got one without")
     assert [layer.name for layer in load_video_model("a.safetensors").layers] == ["object", "background"]
 
 

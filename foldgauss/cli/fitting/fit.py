@@ -70,8 +70,7 @@ def fit(
         typer.Option(
             "--out",
             metavar="MODEL",
-            help=f"FILE{COMPACT_SUFFIX}, or FILE{MODEL_SUFFIX} with float32 parameters "
-            "[default: after the clip, in this folder].",
+            help=f"FILE{COMPACT_SUFFIX}, or FILE{MODEL_SUFFIX} of float32 [default: after the clip, in this folder].",
         ),
     ] = None,
     size: Size = None,
@@ -83,6 +82,7 @@ def fit(
             help=f"Masks, click or {MOVING!r}: objects get layers.",
         ),
     ] = None,
+    shadows: Annotated[bool, typer.Option("--shadows", help="Objects have their shadows, too.")] = False,
     overwrite: Overwrite = False,
     history: Annotated[
         Path | None,
@@ -122,7 +122,9 @@ def fit(
         parse_frames(frames),
         checkpoint_seconds=checkpoint_seconds,
         masks=masks if is_found else str(Path(masks).absolute()),
+        shadows=shadows,
     )
+    require(masks or not shadows, "--shadows", expected="a fit with --masks", got="one without")
     require(
         history is None or masks is None,
         "--history",

@@ -46,6 +46,7 @@ def fit_in_segments(
                 segment_seconds=segment_seconds,
                 checkpoint_seconds=job.checkpoint_seconds,
                 masks=job.masks,
+                shadows=job.shadows,
                 restart=overwrite,
             )
         _print_plan(fit, job.config, display, Path(job.clip), options)
