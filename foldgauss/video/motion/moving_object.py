@@ -110,7 +110,6 @@ def find_moving_object(
     frames: Frames,
     *,
     at: tuple[int, float, float] | None = None,
-    shadow: bool = False,
     alignment: Alignment | None = None,
 ) -> Masks:
     """Where the largest object is that moves on its own, in each frame: bool (num_frames, height, width).
@@ -118,7 +117,7 @@ def find_moving_object(
     `frames` are uint8 (num_frames, height, width, 3), in which the background fills most of the image and moves as a
     plane does, about: a camera that turns, zooms, or passes a distant scene. Each shot has an object of its own, and
     objects that touch count as one. Masks are empty where it is hidden. `at` = (frame, x, y), in pixels, chooses the
-    object there instead of the largest one, in its shot. `shadow`: with the shadow that it casts.
+    object there instead of the largest one, in its shot.
     `alignment` aligns the frames. By default it is estimated. A shot without an object gives a
     warning.
 
@@ -140,7 +139,7 @@ def find_moving_object(
         if at is not None and not first <= at[0] < stop:
             continue
         place = None if at is None else (at[0] - first, *(int(one * small.shape[2] / width) for one in at[1:]))
-        found = _find_in_shot(small[first:stop], alignment.of_shot(first, stop), shadow, place)
+        found = _find_in_shot(small[first:stop], alignment.of_shot(first, stop), place)
         for k, mask in zip(range(first, stop), found, strict=False):
             masks[k] = cv2.resize(mask.astype(np.float32), (width, height), interpolation=cv2.INTER_LINEAR) > 0.5
     if not masks.any():
@@ -157,9 +156,7 @@ def nothing_moves(expected: str, got: object, cure: str = SELECT_OTHERWISE) -> N
     return invalid("moving", expected=expected, got=got, cure=cure, kind=NothingMoves)
 
 
-def _find_in_shot(
-    frames: Frames, alignment: Alignment, shadow: bool, place: tuple[int, int, int] | None = None
-) -> Masks | list:
+def _find_in_shot(frames: Frames, alignment: Alignment, place: tuple[int, int, int] | None) -> Masks | list:
     """The masks of a shot, all of the alignment, at the size of its images; none if nothing moves."""
     if len(frames) < LEAST_FRAMES:
         return []
@@ -172,8 +169,7 @@ def _find_in_shot(
         LEAST_EVIDENCE
     ):
         return []
-    if not shadow:
-        masks = np.stack([_clean(_cut_shadow(mask, dark)) for mask, dark in zip(masks, cues.strong, strict=True)])
+    masks = np.stack([_clean(_cut_shadow(mask, dark)) for mask, dark in zip(masks, cues.strong, strict=True)])
     return _assign_by_color(frames, _vote(masks.astype(np.float32), alignment, MASK_VOTE))
 
 
