@@ -129,7 +129,9 @@ def _cut_out(
     object_color /= np.maximum(cv2.GaussianBlur(weights, (0, 0), spread), 1e-9)[..., None]
     contrast, prior = object_color - behind, 3 * COLOR_ERROR**2
     alpha = ((image - behind) * contrast).sum(-1) + prior * cv2.GaussianBlur(np.float32(mask), (0, 0), EDGE)
-    alpha = np.clip(alpha / ((contrast**2).sum(-1) + prior), 0, 1)
+    # At least so much that there is a color which makes up the image.
+    least = np.maximum((behind - image) / np.maximum(behind, 1), (image - behind) / np.maximum(255 - behind, 1)).max(-1)
+    alpha = np.clip(np.maximum(alpha / ((contrast**2).sum(-1) + prior), least), 0, 1)
     alpha = np.maximum(np.where(mask < cv2.dilate(mask, kernel), alpha, mask), shade)[..., None]
     color = np.clip(image - (1 - alpha) * behind, 0, 255 * alpha)
     return np.concatenate([color, 255 * alpha], -1).round().astype(np.uint8)
@@ -164,14 +166,15 @@ def _find_shadows(
         is_even = np.abs(ratio - light[..., None]).max(-1) < EVENNESS * (1 - light)
         dark = cv2.morphologyEx(np.uint8(known & is_even & (light < SHADED)), cv2.MORPH_OPEN, square)
         dark = cv2.morphologyEx(dark, cv2.MORPH_CLOSE, square, iterations=3) * np.uint8(known & (light < SHADED))
-        num, pieces = cv2.connectedComponents(dark)
+        num, pieces, _, centers = cv2.connectedComponentsWithStats(dark)
         # Of the darkest channel and pixel around: the object's color makes up for the others.
         left = ((frames[k][box] + np.float32(4)) / (plate + np.float32(4))).min(-1)
         taken = np.clip(1 - cv2.erode(left, np.ones((3, 3))), 0, 1)
         for name, mask in masks.items():
             touched = np.zeros(num, bool)
             touched[pieces[dilate(mask[k][box], narrow)]] = True
-            touched[0] = False
+            # Not the background, nor what is higher than the object: dark things beside it.
+            touched &= (np.arange(num) > 0) & (centers[:, 1] > np.mean(np.nonzero(mask[k][box])[0]))
             own = dilate(touched[pieces], narrow) & known
             pieces[own] = 0
             shades[name][k][box] = np.where(own, 255 * taken, 0).round()

@@ -117,9 +117,8 @@ def find_moving_object(
     `frames` are uint8 (num_frames, height, width, 3), in which the background fills most of the image and moves as a
     plane does, about: a camera that turns, zooms, or passes a distant scene. Each shot has an object of its own, and
     objects that touch count as one. Masks are empty where it is hidden. `at` = (frame, x, y), in pixels, chooses the
-    object there instead of the largest one, in its shot.
-    `alignment` aligns the frames. By default it is estimated. A shot without an object gives a
-    warning.
+    object there instead of the largest one, in its shot. `alignment` aligns the frames. By default it is estimated. A
+    shot without an object gives a warning.
 
     It costs about half a second of processor time for each frame, of any size.
 
@@ -138,7 +137,10 @@ def find_moving_object(
     for first, stop in alignment.shots:
         if at is not None and not first <= at[0] < stop:
             continue
-        place = None if at is None else (at[0] - first, *(int(one * small.shape[2] / width) for one in at[1:]))
+        place = None
+        if at is not None:
+            column, row = at[1] * small.shape[2] // width, at[2] * small.shape[1] // height
+            place = at[0] - first, int(column), int(row)
         found = _find_in_shot(small[first:stop], alignment.of_shot(first, stop), place)
         for k, mask in zip(range(first, stop), found, strict=False):
             masks[k] = cv2.resize(mask.astype(np.float32), (width, height), interpolation=cv2.INTER_LINEAR) > 0.5
