@@ -79,6 +79,10 @@ def test_a_shadow_goes_with_its_object_or_stays():
     off = [np.abs(one["background"].astype(float) - empty)[core].mean() for one in (with_it, without)]
     assert off[0] < 8 < 50 < off[1]
     assert min(map(psnr, shaded, composite(with_it))) > 40
+    late = np.zeros_like(masks)
+    late[5:, :9, :9] = True
+    both, _ = separate(shaded, {"late": late, "disc": masks}, shadows=True)
+    assert (both["disc"] == with_it["disc"])[core].mean() > 0.9
     none, _ = separate(frames, {"disc": masks}, shadows=True)
     assert (none["disc"][..., 3] > 0)[~cover(masks, 0.02)].mean() < 0.002
 

@@ -129,9 +129,7 @@ def _cut_out(
     object_color /= np.maximum(cv2.GaussianBlur(weights, (0, 0), spread), 1e-9)[..., None]
     contrast, prior = object_color - behind, 3 * COLOR_ERROR**2
     alpha = ((image - behind) * contrast).sum(-1) + prior * cv2.GaussianBlur(np.float32(mask), (0, 0), EDGE)
-    # At least so much that there is a color which makes up the image.
-    least = np.maximum((behind - image) / np.maximum(behind, 1), (image - behind) / np.maximum(255 - behind, 1)).max(-1)
-    alpha = np.clip(np.maximum(alpha / ((contrast**2).sum(-1) + prior), least), 0, 1)
+    alpha = np.clip(alpha / ((contrast**2).sum(-1) + prior), 0, 1)
     alpha = np.maximum(np.where(mask < cv2.dilate(mask, kernel), alpha, mask), shade)[..., None]
     color = np.clip(image - (1 - alpha) * behind, 0, 255 * alpha)
     return np.concatenate([color, 255 * alpha], -1).round().astype(np.uint8)
@@ -171,6 +169,8 @@ def _find_shadows(
         left = ((frames[k][box] + np.float32(4)) / (plate + np.float32(4))).min(-1)
         taken = np.clip(1 - cv2.erode(left, np.ones((3, 3))), 0, 1)
         for name, mask in masks.items():
+            if not mask[k].any():
+                continue
             touched = np.zeros(num, bool)
             touched[pieces[dilate(mask[k][box], narrow)]] = True
             # Not the background, nor what is higher than the object: dark things beside it.
