@@ -5,7 +5,7 @@
 Each subfolder of --clips holds the frames of a clip, and the subfolder of --masks of the same name its masks, as
 `JPEGImages/480p` and `Annotations/480p` of DAVIS do; clips without masks are left out. Intersection over union is of
 each frame, its mean over all of them. With --given, the true masks of N frames are given, evenly spaced from the first
-to the last (1: of the first one), and `follow_object` finds those of the others, of which the mean then is.
+to the last (1: the first). `follow_object` then finds the object in the other frames, over which the mean is taken.
 """
 
 import time

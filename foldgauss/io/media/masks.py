@@ -100,11 +100,11 @@ def read_object_masks(
     """The masks of each object, by name and frame, for `num_frames` frames of `size`, from frame `first` of a clip on.
 
     A folder of label images, or one: objects are called "object", or "object 1", "object 2" by their labels; a video
-    has one. There is a mask for each frame of the clip or of the part, or images of some of the clip's frames. Each
-    then is of the frame with its name among `names`, those of the clip's images, or else of the frame whose number its
-    name ends with, or else of the first one. Masks of another aspect than `size` are cropped around the center, or
-    refused if `crop` is False. Then they are resized. Objects without pixels are left out, and
-    so are their masks of single frames.
+    has one. Masks are of all frames of the clip or of the part, or they are images of some frames. `names` are the
+    names of the clip's images. An image with one of these names belongs to that frame. Any other image belongs to the
+    frame whose number its name ends with, or to the first frame. Masks of another aspect than `size` are cropped around
+    the center, or refused if `crop` is False. Then they are resized. Objects without pixels are left out, and so are
+    their masks of single frames.
 
     Raises as `read_masks`, and ValueError for fewer frames of a video, and where no object is in the masks.
     """

@@ -30,56 +30,59 @@ from foldgauss.video.motion.moving_object import (
 )
 from foldgauss.video.motion.optical_flow import motion_finder, pixel_grid
 
-#: Lightness is counted in so many bins, and the two color axes of Lab in as many, each of `HUE_BIN` levels,
+#: The number of bins of lightness, and of each color axis of Lab.
 COLOR_BINS = 14
+#: The width of a bin of a color axis, in levels of 255.
 HUE_BIN = 7
-#: after a blur of this standard deviation, in pixels.
+#: Colors are counted after a blur of this standard deviation, in pixels.
 COLOR_BLUR = 0.7
-#: Places, from the center of the object, are counted in cells of this side,
+#: Places relative to the center of the object are counted in square cells of this side, in pixels.
 CELL = 24
-#: so many of them each way; what is farther out counts as the outermost.
+#: The number of cells along each axis. Places farther out count in the outermost cells.
 CELLS = 17
-#: Each of the two cues of motion is counted in so many bins.
+#: The number of bins of each cue of motion.
 MOTION_BINS = 12
-#: Counts are smoothed over neighboring bins with this standard deviation, in bins,
+#: Counts are smoothed over neighboring bins by a Gaussian of this standard deviation, in bins.
 SMOOTHING = 0.8
-#: and so many are added on both sides.
+#: This is added to the counts of colors on both sides, in pixels.
 LEAST_COUNT = 0.01
-#: or this fraction of the pixels, to those of motion.
+#: This is added to the frequencies of motion on both sides.
 LEAST_PART = 2e-3
-#: The surroundings of an object are as wide.
+#: The surroundings of an object, from which the background is learned, have this width in pixels.
 SURROUNDINGS = 60
-#: An object moves by at most this much beside the flow,
+#: The largest distance between an object and the place that the flow predicts, in pixels.
 REACH = 24
-#: and by as much more in each frame in which it is hidden.
+#: This distance grows by as much for each frame in which the object is hidden.
 SEARCH = 6
-#: What is learned is from the given mask, which counts twice, and from the last frames, so many.
+#: Appearance is learned from the given mask, with weight 2, and from this number of frames before.
 MEMORY = 5
-#: The largest log odds of each reason.
+#: The largest log odds of each cue.
 MOST_ODDS = 3.0
-#: Log odds away from where the object is expected.
+#: The log odds of pixels out of reach.
 FAR_ODDS = -6.0
-#: The blur of the place where the object is expected, in pixels.
+#: The blur of the predicted place, in pixels.
 BLUR = 2.0
-#: An object may be where it is expected with more than this probability.
+#: Pixels are within reach of predictions above this probability.
 PERHAPS = 0.3
-#: The speed of an object, by which it moves on while it is hidden, follows that of each frame at this rate.
+#: The rate at which the speed of an object follows the flow. A hidden object moves on at this speed.
 SPEED_RATE = 0.3
-#: The weight of the place where flow and the flow back disagree.
+#: The weight of the predicted place where forward and backward flow disagree.
 LEAST_TRUST = 0.3
-#: Probabilities are smoothed along the edges of the image: weight, and scale in levels of 255.
-EDGE_SMOOTHING, EDGE_LEVELS = 300.0, 6.0
-#: An object is hidden where its area is below this fraction of the usual one.
+#: The weight of edge-preserving smoothing of probabilities.
+EDGE_SMOOTHING = 300.0
+#: Differences of color above this count as edges there, in levels of 255.
+EDGE_LEVELS = 6.0
+#: An object counts as hidden where its area is below this fraction of the usual area.
 HIDDEN = 0.35
-#: It is seen as a whole where its area is above this fraction.
+#: An object counts as seen whole where its area is above this fraction of the usual area.
 WHOLE = 0.7
-#: The usual area follows that of each frame at this rate.
+#: The rate at which the usual area follows the area of each frame.
 AREA_RATE = 0.15
-#: The smallest piece, in pixels.
+#: Pieces of fewer pixels are dropped.
 SMALLEST = 12
-#: The least fraction of a piece where the object is expected.
+#: Pieces are kept if at least this fraction of their pixels is predicted.
 LEAST_EXPECTED = 0.05
-#: The probability where a hidden object is found again by its motion.
+#: The probability of pieces by which a hidden object is found again.
 REFOUND = 0.6
 
 #: How certainly each pixel belongs to the object, in [0, 1].
