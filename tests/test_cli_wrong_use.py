@@ -130,7 +130,7 @@ WRONG = [
     *((f"{FIT} --frames {frames}", 2, "frames: expected") for frames in ("98:99", "4:2")),
     *((f"{FIT} --size {size}", 2, "--size: expected HxW") for size in ("0x10", "48")),
     (f"{FIT} --size 100000x100000", 2, "GiB"),
-    (f"{FIT} --masks three", 2, "masks: expected one for each of 12 frames, got 3 in"),
+    (f"{FIT} --frames 4:8 --masks three", 2, "masks: expected one of a frame from 4 to 7, got others in"),
     (f"{FIT} --masks empty", 2, "masks: expected an object in them, got none in"),
     ("fit two.safetensors --masks moving", 2, "frames: expected uint8 .* of 3 or more frames"),
     ("fit other.safetensors", 1, "other.safetensors"),

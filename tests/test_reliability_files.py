@@ -245,7 +245,7 @@ def test_draws_without_room(work, tmp_path, capsys):
 @pytest.fixture
 def before_any_work(monkeypatch):
     """A fit that comes as far as reading its clip fails the test."""
-    for name in ("read_video", "fit_steps"):
+    for name in ("read_clip_or_model", "fit_steps"):
         monkeypatch.setattr(runner, name, lambda *a, name=name, **k: pytest.fail(f"{name} was called"))
 
 
